@@ -1,0 +1,130 @@
+# fbard: one non-recursive Makefile. `make help` lists the targets; `make V=1` shows the commands.
+-include config.mk
+
+# The one list of what a fresh Debian 12 machine lacks.
+PACKAGES = build-essential pkg-config libmicrohttpd-dev libcjson-dev libzmq3-dev libhdf5-dev \
+	libcurl4-gnutls-dev libxxhash-dev libcmocka-dev gnuplot-nox fonts-dejavu-core curl \
+	python3 python3-h5py python3-pytest python3-zmq python3-jsonschema
+# Needed by some targets only: clang builds and the fuzzers; `make check-long`.
+PACKAGES_CLANG = clang-14 libomp-14-dev
+PACKAGES_LONG = $(PACKAGES_CLANG) python3-paraview
+
+CC ?= gcc
+ifeq ($(origin CC),default)
+CC = gcc
+endif
+VARIANT ?= release
+PREFIX ?= /usr/local
+DESTDIR ?=
+PYTHON ?= /usr/bin/python3
+PKG_CONFIG ?= pkg-config
+V ?= 0
+Q = $(if $(filter 1,$(V)),,@)
+say = $(if $(filter 1,$(V)),@:,@printf '  %-7s %s\n' $(1) $(2))
+
+B = build/$(VARIANT)
+VERSION = 0.1.0
+
+WARN = -Wall -Wextra -Wpedantic -Wshadow -Wstrict-prototypes -Wmissing-prototypes -Wvla
+CFLAGS.release = -O3 -g
+CFLAGS.debug = -O0 -g3
+CFLAGS.asan = -O1 -g -fsanitize=address,undefined -fno-sanitize-recover=all -fno-omit-frame-pointer
+CFLAGS.tsan = -O1 -g -fsanitize=thread
+CFLAGS.coverage = -O0 -g --coverage
+# One meaning of a*b + c for every compiler; no errno, no traps; never -ffast-math.
+FLOAT = -ffp-contract=fast -fno-math-errno -fno-trapping-math
+ALL_CFLAGS = -std=c17 -D_GNU_SOURCE -DFBARD_VERSION='"$(VERSION)"' -I. -MMD -MP $(WARN) $(FLOAT) $(CFLAGS.$(VARIANT)) $(CFLAGS)
+OPENMP ?= -fopenmp
+ifeq ($(VARIANT),tsan)
+OPENMP =
+endif
+ALL_LDFLAGS = $(CFLAGS.$(VARIANT)) $(LDFLAGS)
+
+pc_cflags = $(shell $(PKG_CONFIG) --cflags $(1))
+pc_libs = $(shell $(PKG_CONFIG) --libs $(1))
+HDF5_PC = $(shell $(PKG_CONFIG) --exists hdf5 && echo hdf5 || echo hdf5-serial)
+
+MPM_SRC = $(sort $(wildcard server/mpm/*.c server/mpm/material/*.c))
+PROTO_SRC = $(sort $(wildcard proto/*.c))
+SERVER_SRC = $(sort $(wildcard server/*.c))
+CLIENT_SRC = $(sort $(wildcard client/*.c))
+SCENES = $(sort $(wildcard scenes/*.json))
+
+obj = $(patsubst %.c,$(B)/obj/%.o,$(1))
+
+.PHONY: all deps libmpm demo check check-unit check-physics check-api check-long clean help format tidy bench
+.DELETE_ON_ERROR:
+.SECONDARY:
+
+all: build/fbard build/fbar
+
+# build/fbard and build/fbar are the release programs; other variants stay in their own folder.
+build/fbard: $(B)/fbard
+	$(Q)cp $< $@.new && mv $@.new $@
+build/fbar: $(B)/fbar
+	$(Q)cp $< $@.new && mv $@.new $@
+
+libmpm: $(B)/libmpm.a
+
+$(B)/libmpm.a: $(call obj,$(MPM_SRC))
+	$(call say,AR,$@)
+	$(Q)rm -f $@ && $(AR) rcs $@ $^
+
+$(B)/obj/server/mpm/%.o: ALL_CFLAGS += $(OPENMP)
+SERVER_LIBS = libmicrohttpd libcjson libzmq libxxhash
+CLIENT_LIBS = libcurl libcjson libzmq libxxhash $(HDF5_PC)
+$(call obj,$(SERVER_SRC)): ALL_CFLAGS += $(call pc_cflags,$(SERVER_LIBS)) -pthread
+$(call obj,$(CLIENT_SRC)): ALL_CFLAGS += $(call pc_cflags,$(CLIENT_LIBS)) -pthread
+$(call obj,$(PROTO_SRC)): ALL_CFLAGS += $(call pc_cflags,libxxhash)
+
+$(B)/obj/%.o: %.c Makefile
+	$(call say,CC,$<)
+	@mkdir -p $(@D)
+	$(Q)$(CC) $(ALL_CFLAGS) -c $< -o $@
+
+# The built-in scenes, embedded as they are.
+$(B)/gen/scenes_data.c: $(SCENES) Makefile
+	$(call say,EMBED,scenes)
+	@mkdir -p $(@D)
+	$(Q){ echo '#include "server/scenes_data.h"'; \
+	for f in $(SCENES); do n=$$(basename $$f .json | tr - _); echo "static const char text_$$n[] = {"; \
+	od -An -v -tx1 $$f | sed 's/ \([0-9a-f][0-9a-f]\)/0x\1,/g'; echo "0};"; done; \
+	echo "const struct scenes_data scenes_data[] = {"; \
+	for f in $(SCENES); do n=$$(basename $$f .json); echo "{\"$$n\", text_$$(echo $$n | tr - _), sizeof text_$$(echo $$n | tr - _) - 1},"; done; \
+	echo "{0, 0, 0}};"; } > $@
+$(B)/obj/gen/scenes_data.o: $(B)/gen/scenes_data.c
+	@mkdir -p $(@D)
+	$(Q)$(CC) $(ALL_CFLAGS) -c $< -o $@
+
+SERVER_OBJ = $(filter-out %/main.o,$(call obj,$(SERVER_SRC))) $(B)/obj/gen/scenes_data.o
+$(B)/fbard: $(call obj,server/main.c) $(SERVER_OBJ) $(call obj,$(PROTO_SRC)) $(B)/libmpm.a
+	$(call say,LD,$@)
+	$(Q)$(CC) $(ALL_LDFLAGS) -pthread $(OPENMP) $^ $(call pc_libs,$(SERVER_LIBS)) -lm -o $@
+$(B)/fbar: $(call obj,$(CLIENT_SRC)) $(call obj,$(PROTO_SRC))
+	$(call say,LD,$@)
+	$(Q)$(CC) $(ALL_LDFLAGS) -pthread $^ $(call pc_libs,$(CLIENT_LIBS)) -lm -o $@
+
+# Tests: tests/unit/test_*.c and tests/physics/test_*.c are cmocka programs, linked against everything.
+UNIT = $(patsubst tests/%.c,$(B)/tests/%,$(sort $(wildcard tests/unit/test_*.c)))
+PHYSICS = $(patsubst tests/%.c,$(B)/tests/%,$(sort $(wildcard tests/physics/test_*.c)))
+$(B)/obj/tests/%.o: ALL_CFLAGS += $(call pc_cflags,$(SERVER_LIBS) cmocka) -Wno-missing-prototypes
+$(B)/tests/%: $(B)/obj/tests/%.o $(SERVER_OBJ) $(call obj,$(PROTO_SRC)) $(B)/libmpm.a
+	$(call say,LD,$@)
+	@mkdir -p $(@D)
+	$(Q)$(CC) $(ALL_LDFLAGS) -pthread $(OPENMP) $^ $(call pc_libs,$(SERVER_LIBS) cmocka) -lm -o $@
+
+check-unit: $(UNIT)
+	$(Q)set -e; for t in $^; do echo "== $$t"; $$t; done
+check-physics: $(PHYSICS)
+	$(Q)set -e; for t in $^; do echo "== $$t"; $$t; done
+
+format:
+	clang-format -i $(shell git ls-files '*.c' '*.h')
+
+clean:
+	rm -rf build
+
+help:
+	@sed -n 's/^\([a-z][a-z-]*\):.*## \(.*\)/  \1\t\2/p' Makefile
+
+-include $(shell find build -name '*.d' 2>/dev/null)

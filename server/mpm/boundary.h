@@ -1,0 +1,38 @@
+// Wall conditions on the grid.
+//
+// uGIMP and linear: nodes on and beyond the wall get the condition. B-splines: the ghost nodes
+// behind the wall are mirror-folded, as if an image of the body moved on the other side: normal
+// components are odd, tangential ones even (slip) or odd (fixed), mass and volume even. So v_n =
+// v_wall exactly on the plane; merely fixing nodes lets water sink into the wall (docs/method.md
+// section 5).
+#pragma once
+#include "server/mpm/grid.h"
+
+struct mpm_wall {
+    struct mpm_wall_def def;
+    bool active, folds;                   // in force; mirror-folded (B-splines)
+    int plane;                            // node index of the wall along its axis
+    int ghost, inner;                     // the node planes behind it and in front of it
+    int lo[MPM_MAX_DIM], hi[MPM_MAX_DIM]; // its nodes in the other directions: lo <= i < hi
+    bool wants_reaction;                  // a probe asks for it, or the wall moves
+    double reaction[MPM_MAX_DIM];         // N, force on the wall in the last step
+    // (nodes of three planes in the window; m, f) before folding, where the reaction is wanted
+    double *real;
+    unsigned char *open; // (nodes of the plane) a `separate` column that leaves its wall
+};
+
+// `wants_reaction`: a probe asks for it. False when memory is short.
+bool mpm_wall_create(struct mpm_wall *wall, const struct mpm_wall_def *def,
+                     const struct mpm_grid *grid, enum mpm_basis basis, bool wants_reaction);
+void mpm_wall_free(struct mpm_wall *wall);
+
+// Before the nodes move: folds mass, momentum and force of the ghost nodes (B-splines only).
+void mpm_walls_fold(struct mpm_wall *walls, size_t n_walls, struct mpm_grid *grid,
+                    const double *gravity, double dt);
+// After: the condition on v^{n+1} (and, where folded, the ghost nodes' values), and the reactions.
+void mpm_walls_apply(struct mpm_wall *walls, size_t n_walls, struct mpm_grid *grid, double dt);
+// Folds the sums that F-bar averages (even); and, once they are averages, gives the ghosts theirs.
+void mpm_walls_fold_fbar(const struct mpm_wall *walls, size_t n_walls, struct mpm_grid *grid);
+void mpm_walls_mirror_fbar(const struct mpm_wall *walls, size_t n_walls, struct mpm_grid *grid);
+// Widens the window so that a folding wall in it lies in it with all its three planes.
+void mpm_walls_extend_window(const struct mpm_wall *walls, size_t n_walls, struct mpm_grid *grid);

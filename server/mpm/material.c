@@ -1,0 +1,45 @@
+// The list of all constitutive models. A new one is its file in material/ and two lines here.
+#include "server/mpm/material.h"
+
+#include <string.h>
+
+extern const struct mpm_material mpm_material_neo_hookean, mpm_material_newtonian;
+
+static const struct mpm_material *const materials[] = {
+    &mpm_material_neo_hookean,
+    &mpm_material_newtonian,
+};
+
+size_t mpm_material_count(void) {
+    return sizeof materials / sizeof *materials;
+}
+
+const struct mpm_material *mpm_material_at(size_t index) {
+    return materials[index];
+}
+
+const struct mpm_material *mpm_material_find(const char *model) {
+    for (size_t k = 0; k < mpm_material_count(); k++) {
+        if (strcmp(materials[k]->name, model) == 0) {
+            return materials[k];
+        }
+    }
+    return NULL;
+}
+
+const char *mpm_material_name(const struct mpm_material *model) {
+    return model->name;
+}
+
+const char *mpm_material_doc(const struct mpm_material *model) {
+    return model->doc;
+}
+
+const struct mpm_parameter *mpm_material_parameter(const struct mpm_material *model, size_t k) {
+    for (size_t i = 0; i < k; i++) {
+        if (!model->parameters[i].key) {
+            return NULL;
+        }
+    }
+    return model->parameters[k].key ? &model->parameters[k] : NULL;
+}

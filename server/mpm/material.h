@@ -1,0 +1,41 @@
+// Inside of a constitutive model: one file in material/ with one descriptor, one line in
+// material.c.
+#pragma once
+#include "server/mpm/mpm.h"
+#include "server/mpm/tensor.h"
+
+struct mpm_particles;
+
+// What a model keeps of the deformation.
+enum mpm_kinematics {
+    MPM_KEEPS_F, // the deformation gradient
+    MPM_KEEPS_J, // the volume ratio only (fluids)
+};
+#define MPM_N_KINEMATICS 2
+
+struct mpm_material {
+    const char *name, *doc;
+    enum mpm_kinematics kinematics;
+    const struct mpm_parameter *parameters; // ends with a NULL key; the first is the density
+    // P-wave speed, m/s, at rest.
+    double (*wave_speed)(const double *parameters);
+    // Largest kinematic viscosity, m^2/s, that limits dt; NULL = none.
+    double (*diffusivity)(const double *parameters);
+    // Cauchy stress of particles [begin, end) from their deformation, in 2D and 3D. A model with a
+    // rate part adds to what `rate_stress` left.
+    void (*stress[2])(struct mpm_particles *s, size_t begin, size_t end);
+    // The part that depends on the velocity gradient L ((end - begin), 9; row-major dim x dim in
+    // the first entries), written over sigma; NULL = none.
+    void (*rate_stress[2])(struct mpm_particles *s, size_t begin, size_t end, double (*L)[9]);
+    // Strain energy per reference volume, J/m^3, of particle p.
+    double (*energy)(const struct mpm_particles *s, size_t p);
+};
+
+// Stamps out the 2D and 3D entry points of a kernel written once with a `const int dim`.
+#define MPM_STRESS_2D_3D(kernel)                                                                   \
+    static void kernel##_2d(struct mpm_particles *s, size_t begin, size_t end) {                   \
+        kernel(s, begin, end, 2);                                                                  \
+    }                                                                                              \
+    static void kernel##_3d(struct mpm_particles *s, size_t begin, size_t end) {                   \
+        kernel(s, begin, end, 3);                                                                  \
+    }

@@ -1,0 +1,93 @@
+// Compressible Neo-Hookean solid: psi = mu/2 (tr b - 3) - mu ln J + lambda/2 (ln J)^2,
+// sigma = [mu (b - 1) + lambda ln J 1] / J with b = F F^T, and F33 = 1 in plane strain.
+#include <float.h>
+
+#include "server/mpm/particles.h"
+
+enum { DENSITY, YOUNGS_MODULUS, POISSON_RATIO };
+
+static const struct mpm_parameter parameters[] = {
+    [DENSITY] = {.key = "density",
+                 .unit = "kg/m^3",
+                 .doc = "reference density",
+                 .min = 0,
+                 .min_open = true,
+                 .max = DBL_MAX,
+                 .required = true},
+    [YOUNGS_MODULUS] = {.key = "youngs_modulus",
+                        .unit = "Pa",
+                        .doc = "Young's modulus at rest",
+                        .min = 0,
+                        .min_open = true,
+                        .max = DBL_MAX,
+                        .required = true},
+    [POISSON_RATIO] = {.key = "poisson_ratio",
+                       .unit = "1",
+                       .doc = "Poisson's ratio at rest",
+                       .min = -1,
+                       .min_open = true,
+                       .max = 0.5,
+                       .max_open = true,
+                       .required = true},
+    {.key = NULL},
+};
+
+static double shear_modulus(const double *par) {
+    return par[YOUNGS_MODULUS] / (2 * (1 + par[POISSON_RATIO]));
+}
+
+static double lame_lambda(const double *par) {
+    const double nu = par[POISSON_RATIO];
+    return par[YOUNGS_MODULUS] * nu / ((1 + nu) * (1 - 2 * nu));
+}
+
+static double wave_speed(const double *par) {
+    return sqrt((lame_lambda(par) + 2 * shear_modulus(par)) / par[DENSITY]);
+}
+
+MPM_KERNEL void stress(struct mpm_particles *s, size_t begin, size_t end, const int dim) {
+    const double mu = shear_modulus(s->parameters), lambda = lame_lambda(s->parameters);
+    for (size_t p = begin; p < end; p++) {
+        double F[9];
+        for (int k = 0; k < dim * dim; k++) {
+            F[k] = s->F[mpm_at(p, dim * dim, k)];
+        }
+        const double J = mpm_det(F, dim), r = 1 / J, pressure_part = lambda * log(J);
+        for (int k = 0; k < MPM_SYM(dim); k++) {
+            const int i = mpm_sym_row(k), j = mpm_sym_column(k);
+            double b = i == j; // b33 = 1 in plane strain
+            if (i < dim && j < dim) {
+                b = 0;
+                for (int d = 0; d < dim; d++) {
+                    b += F[i * dim + d] * F[j * dim + d];
+                }
+            }
+            const double tau = i == j ? mu * (b - 1) + pressure_part : mu * b;
+            s->sigma[mpm_at(p, MPM_SYM(dim), k)] = r * tau;
+        }
+    }
+}
+MPM_STRESS_2D_3D(stress)
+
+static double energy(const struct mpm_particles *s, size_t p) {
+    const double mu = shear_modulus(s->parameters), lambda = lame_lambda(s->parameters);
+    const int n = s->dim * s->dim;
+    double trace_b = s->dim == 2; // b33
+    for (int k = 0; k < n; k++) {
+        const double f = s->F[mpm_at(p, n, k)];
+        trace_b += f * f;
+    }
+    const double log_J = log(mpm_ratio_in_use(s, p));
+    return mu / 2 * (trace_b - 3) - mu * log_J + lambda / 2 * log_J * log_J;
+}
+
+extern const struct mpm_material mpm_material_neo_hookean;
+const struct mpm_material mpm_material_neo_hookean = {
+    .name = "neo_hookean",
+    .doc = "Compressible Neo-Hookean solid: sigma = [mu (b - 1) + lambda ln J 1] / J.",
+    .kinematics = MPM_KEEPS_F,
+    .parameters = parameters,
+    .wave_speed = wave_speed,
+    .stress = {stress_2d, stress_3d},
+    .energy = energy,
+};

@@ -1,0 +1,246 @@
+// Filling shapes with particles: an n^dim lattice in each cell, kept where the shape holds the
+// point.
+//
+// A lattice point sits at odd multiples of half a spacing from the domain's corner. Whether it lies
+// on an edge is decided in those units: an edge within SNAP of a multiple of half a spacing is
+// taken to be that multiple, so that round-off in the input cannot move it across a particle.
+#include "server/mpm/seed.h"
+
+#include <math.h>
+
+#define SNAP 1e-7 // half spacings
+
+struct lattice {
+    int dim;
+    double origin[MPM_MAX_DIM]; // m
+    double unit;                // m, half a spacing
+    bool closed;
+};
+
+static double snapped(double value, double origin, double unit) {
+    const double u = (value - origin) / unit, whole = round(u);
+    return fabs(u - whole) < SNAP ? whole : u;
+}
+
+// Sign of how far the point is inside the shape: > 0 inside, 0 on the edge, < 0 outside.
+static int side(const struct mpm_shape *shape, const struct lattice *l, const double *point) {
+    switch (shape->kind) {
+    case MPM_SHAPE_BOX: {
+        int least = 1;
+        for (int d = 0; d < l->dim; d++) {
+            const double a = snapped(shape->min[d], l->origin[d], l->unit);
+            const double b = snapped(shape->max[d], l->origin[d], l->unit);
+            const int here = point[d] < a || point[d] > b     ? -1
+                             : point[d] == a || point[d] == b ? 0
+                                                              : 1;
+            least = here < least ? here : least;
+        }
+        return least;
+    }
+    case MPM_SHAPE_BALL: {
+        double r2 = 0;
+        for (int d = 0; d < l->dim; d++) {
+            const double e = point[d] - snapped(shape->centre[d], l->origin[d], l->unit);
+            r2 += e * e;
+        }
+        const double radius = snapped(shape->radius, 0, l->unit), gap = radius * radius - r2;
+        return fabs(gap) < SNAP * radius ? 0 : gap > 0 ? 1 : -1;
+    }
+    case MPM_SHAPE_POINTS:
+        return -1;
+    case MPM_SHAPE_UNION: {
+        int most = -1;
+        for (size_t k = 0; k < shape->n_children; k++) {
+            const int here = side(&shape->children[k], l, point);
+            most = here > most ? here : most;
+        }
+        return most;
+    }
+    case MPM_SHAPE_DIFFERENCE:
+    case MPM_SHAPE_INTERSECTION: {
+        int least = 1;
+        for (size_t k = 0; k < shape->n_children; k++) {
+            const int sign = shape->kind == MPM_SHAPE_DIFFERENCE && k > 0 ? -1 : 1;
+            const int here = sign * side(&shape->children[k], l, point);
+            least = here < least ? here : least;
+        }
+        return least;
+    }
+    }
+    return -1;
+}
+
+bool mpm_shape_contains(const struct mpm_shape *shape, const double *x, int dim, double margin) {
+    // In units of the margin, so that "on the edge" is anything closer than SNAP margins.
+    const struct lattice l = {.dim = dim, .unit = margin};
+    double point[MPM_MAX_DIM];
+    for (int d = 0; d < dim; d++) {
+        point[d] = x[d] / margin;
+    }
+    return side(shape, &l, point) > 0;
+}
+
+bool mpm_shape_bounds(const struct mpm_shape *shape, int dim, double *min, double *max) {
+    for (int d = 0; d < dim; d++) {
+        min[d] = INFINITY;
+        max[d] = -INFINITY;
+    }
+    switch (shape->kind) {
+    case MPM_SHAPE_BOX:
+        for (int d = 0; d < dim; d++) {
+            min[d] = shape->min[d];
+            max[d] = shape->max[d];
+        }
+        break;
+    case MPM_SHAPE_BALL:
+        for (int d = 0; d < dim; d++) {
+            min[d] = shape->centre[d] - shape->radius;
+            max[d] = shape->centre[d] + shape->radius;
+        }
+        break;
+    case MPM_SHAPE_POINTS:
+        for (size_t k = 0; k < shape->n_points; k++) {
+            for (int d = 0; d < dim; d++) {
+                const double x = shape->points[k * (size_t)(dim + 1) + (size_t)d];
+                min[d] = fmin(min[d], x);
+                max[d] = fmax(max[d], x);
+            }
+        }
+        break;
+    case MPM_SHAPE_DIFFERENCE: // what is taken away cannot make it larger
+        if (shape->n_children > 0) {
+            return mpm_shape_bounds(&shape->children[0], dim, min, max);
+        }
+        break;
+    case MPM_SHAPE_UNION:
+    case MPM_SHAPE_INTERSECTION:
+        for (size_t k = 0; k < shape->n_children; k++) {
+            double a[MPM_MAX_DIM], b[MPM_MAX_DIM];
+            mpm_shape_bounds(&shape->children[k], dim, a, b);
+            for (int d = 0; d < dim; d++) {
+                const bool all = shape->kind == MPM_SHAPE_INTERSECTION && k > 0;
+                min[d] = all ? fmax(min[d], a[d]) : fmin(min[d], a[d]);
+                max[d] = all ? fmin(max[d], b[d]) : fmax(max[d], b[d]);
+            }
+        }
+        break;
+    }
+    for (int d = 0; d < dim; d++) {
+        if (!(min[d] <= max[d])) {
+            return false;
+        }
+    }
+    return true;
+}
+
+// Lattice indices [first, last) per direction that can hold points of the shape.
+static bool lattice_range(const struct mpm_def *def, const struct mpm_body_def *body, double *first,
+                          double *last) {
+    double min[MPM_MAX_DIM], max[MPM_MAX_DIM];
+    if (!mpm_shape_bounds(&body->shape, def->dimension, min, max)) {
+        return false;
+    }
+    const double spacing = def->cell / body->particles_per_direction;
+    for (int d = 0; d < def->dimension; d++) {
+        first[d] = floor((min[d] - def->domain_min[d]) / spacing - 1);
+        last[d] = ceil((max[d] - def->domain_min[d]) / spacing + 1);
+    }
+    return true;
+}
+
+double mpm_seed_bound(const struct mpm_def *def, const struct mpm_body_def *body) {
+    if (body->shape.kind == MPM_SHAPE_POINTS) {
+        return (double)body->shape.n_points;
+    }
+    double first[MPM_MAX_DIM], last[MPM_MAX_DIM], bound = 1;
+    if (!lattice_range(def, body, first, last)) {
+        return 0;
+    }
+    for (int d = 0; d < def->dimension; d++) {
+        bound *= last[d] - first[d];
+    }
+    return bound;
+}
+
+size_t mpm_seed(const struct mpm_def *def, const struct mpm_body_def *body,
+                bool (*each)(void *context, const double *x, double volume), void *context) {
+    const int dim = def->dimension;
+    if (body->shape.kind == MPM_SHAPE_POINTS) {
+        for (size_t k = 0; k < body->shape.n_points; k++) {
+            const double *point = body->shape.points + k * (size_t)(dim + 1);
+            if (each && !each(context, point, point[dim])) {
+                return k;
+            }
+        }
+        return body->shape.n_points;
+    }
+    double first[MPM_MAX_DIM], last[MPM_MAX_DIM];
+    if (!lattice_range(def, body, first, last)) {
+        return 0;
+    }
+    const double spacing = def->cell / body->particles_per_direction;
+    struct lattice l = {.dim = dim, .unit = spacing / 2, .closed = body->closed};
+    long long from[MPM_MAX_DIM] = {0}, to[MPM_MAX_DIM] = {1, 1, 1};
+    double volume = 1;
+    for (int d = 0; d < dim; d++) {
+        l.origin[d] = def->domain_min[d];
+        from[d] = (long long)first[d];
+        to[d] = (long long)last[d];
+        volume *= spacing;
+    }
+    size_t count = 0;
+    for (long long i = from[0]; i < to[0]; i++) {
+        for (long long j = from[1]; j < to[1]; j++) {
+            for (long long k = from[2]; k < to[2]; k++) {
+                const long long index[MPM_MAX_DIM] = {i, j, k};
+                double point[MPM_MAX_DIM], x[MPM_MAX_DIM];
+                for (int d = 0; d < dim; d++) {
+                    point[d] = (double)(2 * index[d] + 1);
+                    x[d] = l.origin[d] + ((double)index[d] + 0.5) * spacing;
+                }
+                if (side(&body->shape, &l, point) < (l.closed ? 0 : 1)) {
+                    continue;
+                }
+                if (each && !each(context, x, volume)) {
+                    return count;
+                }
+                count++;
+            }
+        }
+    }
+    return count;
+}
+
+void mpm_velocity_at(const struct mpm_velocity *field, const double *x, int dim, double *v) {
+    double r[MPM_MAX_DIM];
+    for (int d = 0; d < dim; d++) {
+        v[d] = 0;
+        r[d] = x[d] - field->centre[d];
+    }
+    switch (field->kind) {
+    case MPM_VELOCITY_UNIFORM:
+        for (int d = 0; d < dim; d++) {
+            v[d] = field->vector[d];
+        }
+        break;
+    case MPM_VELOCITY_ROTATION:
+        if (dim == 2) {
+            v[0] = -field->rate * r[1];
+            v[1] = field->rate * r[0];
+        } else {
+            const double *n = field->vector;
+            v[0] = field->rate * (n[1] * r[2] - n[2] * r[1]);
+            v[1] = field->rate * (n[2] * r[0] - n[0] * r[2]);
+            v[2] = field->rate * (n[0] * r[1] - n[1] * r[0]);
+        }
+        break;
+    case MPM_VELOCITY_MODE:
+        v[field->axis] = field->amplitude * sin((2 * field->number - 1) * M_PI / 2 *
+                                                (x[field->axis] - field->from) / field->length);
+        break;
+    }
+}
+
+double mpm_seed_half(const struct mpm_body_def *body) {
+    return 1 / (2.0 * body->particles_per_direction);
+}

@@ -1,0 +1,574 @@
+// Create, free, settings and stages of a simulation.
+#include "server/mpm/sim.h"
+
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "server/mpm/seed.h"
+
+#define STABLE_CFL                                                                                 \
+    0.5 // dt <= 0.5 h/c is stable for every basis, with F-bar and without (docs/method.md)
+
+struct mpm_settings mpm_settings_default(void) {
+    return (struct mpm_settings){
+        .fbar = {.scheme = MPM_FBAR_OFF, .a = 0.05, .C = 1}, .blend = 1, .cfl = 0.3};
+}
+
+struct mpm_def mpm_def_default(void) {
+    return (struct mpm_def){
+        .dimension = 2, .basis = MPM_GIMP, .settings = mpm_settings_default(), .n_threads = 1};
+}
+
+const struct mpm_material_def *mpm_material_of(const struct mpm_def *def, int material,
+                                               size_t stage) {
+    for (size_t k = stage + 1; k-- > 0;) {
+        if (def->stages[k].materials) {
+            return &def->stages[k].materials[material];
+        }
+    }
+    return &def->materials[material];
+}
+
+double mpm_wave_speed(const struct mpm_sim *sim) {
+    double largest = 0;
+    for (size_t b = 0; b < sim->n_sets; b++) {
+        const double c = sim->sets[b].material->wave_speed(sim->sets[b].parameters);
+        largest = c > largest ? c : largest;
+    }
+    return largest;
+}
+
+static double diffusivity(const struct mpm_sim *sim) {
+    double largest = 0;
+    for (size_t b = 0; b < sim->n_sets; b++) {
+        const struct mpm_particles *s = &sim->sets[b];
+        const double nu = s->material->diffusivity ? s->material->diffusivity(s->parameters) : 0;
+        largest = nu > largest ? nu : largest;
+    }
+    return largest;
+}
+
+// Explicit waves need dt <= STABLE_CFL h/c, explicit diffusion dt <= h^2/(2 dim nu); together the
+// rates add, and the same safety is kept for both.
+double mpm_dt_limit_at(double h, double wave_speed, double v_max, double nu, int dim) {
+    return STABLE_CFL / ((wave_speed + v_max) / h + 2 * dim * nu / (h * h));
+}
+
+double mpm_dt_limit(const struct mpm_sim *sim) {
+    return mpm_dt_limit_at(sim->grid.h, mpm_wave_speed(sim), sqrt(sim->c.v2_max), diffusivity(sim),
+                           sim->grid.dim);
+}
+
+double mpm_next_dt(const struct mpm_sim *sim) {
+    const struct mpm_clockwork *c = &sim->c;
+    const double dt = c->now.dt > 0 ? c->now.dt : c->now.cfl / STABLE_CFL * mpm_dt_limit(sim);
+    const double left = c->stage_end - c->time;
+    // Fit the last step to the end, but leave a whole step whole whatever round-off says.
+    return left < dt * (1 - 1e-6) ? left : dt;
+}
+
+void mpm_gravity_at(const struct mpm_sim *sim, double t, double *g) {
+    const struct mpm_clockwork *c = &sim->c;
+    const double ramp = sim->def->stages[c->stage].gravity_ramp;
+    const double part = ramp > 0 ? fmin(1, (t - c->stage_begin) / ramp) : 1;
+    for (int d = 0; d < MPM_MAX_DIM; d++) {
+        g[d] = part * c->now.gravity[d] + (1 - part) * c->gravity_before[d];
+    }
+}
+
+static void overlay(struct mpm_settings *on, const struct mpm_settings *from, unsigned which) {
+    if (which & MPM_SET_FBAR) {
+        on->fbar = from->fbar;
+    }
+    if (which & MPM_SET_GRAVITY) {
+        memcpy(on->gravity, from->gravity, sizeof on->gravity);
+    }
+    if (which & MPM_SET_DAMPING) {
+        on->damping_local = from->damping_local;
+        on->damping_mass = from->damping_mass;
+    }
+    if (which & MPM_SET_BLEND) {
+        on->blend = from->blend;
+    }
+    if (which & MPM_SET_TIME) {
+        on->dt = from->dt;
+        on->cfl = from->cfl;
+    }
+}
+
+// The base settings with what the stage states.
+static struct mpm_settings stage_settings(const struct mpm_def *def, size_t stage,
+                                          const struct mpm_settings *base) {
+    struct mpm_settings now = *base;
+    overlay(&now, &def->stages[stage].settings, def->stages[stage].states);
+    return now;
+}
+
+bool mpm_provide_fbar(struct mpm_sim *sim, enum mpm_fbar_scheme scheme) {
+    if (scheme == MPM_FBAR_OFF) {
+        return true;
+    }
+    bool ok = mpm_grid_add_fbar(&sim->grid, mpm_fbar_scalars(scheme));
+    for (size_t b = 0; ok && b < sim->n_sets; b++) {
+        if (sim->sets[b].wants_fbar) {
+            ok = mpm_particles_add_fbar(&sim->sets[b]);
+        }
+    }
+    return ok;
+}
+
+static void update_stress(struct mpm_particles *s) {
+    const int n = MPM_SYM(s->dim);
+    if (s->material->rate_stress[s->dim - 2]) { // keep the rate part, whose mean is 0
+        for (size_t p = 0; p < s->n; p++) {
+            double mean = 0;
+            for (int k = 0; k < 3; k++) {
+                mean += s->sigma[mpm_at(p, n, k)] / 3;
+            }
+            for (int k = 0; k < 3; k++) {
+                s->sigma[mpm_at(p, n, k)] -= mean;
+            }
+        }
+    }
+    s->material->stress[s->dim - 2](s, 0, s->n);
+}
+
+// Length of the stages before the last, from `stage` on.
+static double time_before_last(const struct mpm_def *def, size_t stage) {
+    double t = 0;
+    for (size_t k = stage; k + 1 < def->n_stages; k++) {
+        t += def->stages[k].duration;
+    }
+    return t;
+}
+
+static void reset(struct mpm_sim *sim, unsigned what) {
+    for (size_t b = 0; b < sim->n_sets; b++) {
+        struct mpm_particles *s = &sim->sets[b];
+        for (size_t p = 0; p < s->n; p++) {
+            for (int d = 0; d < s->dim; d++) {
+                const size_t at = mpm_at(p, s->dim, d);
+                if (what & MPM_RESET_VELOCITY) {
+                    s->v[at] = 0;
+                }
+                if ((what & MPM_RESET_DISPLACEMENT) && s->x0) {
+                    s->x0[at] = s->x[at];
+                }
+            }
+        }
+    }
+    if (what & MPM_RESET_VELOCITY) {
+        sim->c.v2_max = 0;
+    }
+}
+
+void mpm_restore_stage(struct mpm_sim *sim) {
+    for (size_t b = 0; b < sim->n_sets; b++) {
+        struct mpm_particles *s = &sim->sets[b];
+        const struct mpm_material_def *m =
+            mpm_material_of(sim->def, sim->def->bodies[b].material, sim->c.stage);
+        memcpy(s->parameters, m->parameters, sizeof s->parameters);
+        s->density = m->parameters[0];
+    }
+}
+
+void mpm_enter_stage(struct mpm_sim *sim, size_t stage) {
+    const struct mpm_def *def = sim->def;
+    const struct mpm_stage_def *s = &def->stages[stage];
+    struct mpm_clockwork *c = &sim->c;
+    if (stage > 0) {
+        mpm_gravity_at(sim, c->time, c->gravity_before);
+    }
+    c->stage = stage;
+    c->stage_begin = c->time = c->anchor_time = -time_before_last(def, stage);
+    c->stage_end = stage + 1 == def->n_stages ? c->end : -time_before_last(def, stage + 1);
+    c->steps_since_anchor = 0;
+    c->kinetic_max = 0;
+    c->now = stage_settings(def, stage, &c->base);
+    for (size_t k = 0; s->removes_wall && k < sim->n_walls; k++) {
+        sim->walls[k].active &= !s->removes_wall[k];
+        if (s->removes_wall[k]) {
+            memset(sim->walls[k].reaction, 0, sizeof sim->walls[k].reaction);
+        }
+    }
+    if (s->materials) {
+        mpm_restore_stage(sim);
+        for (size_t b = 0; b < sim->n_sets; b++) {
+            update_stress(&sim->sets[b]);
+        }
+    }
+    reset(sim, s->resets);
+}
+
+// ---- Create
+// ---------------------------------------------------------------------------------------
+
+struct filling {
+    struct mpm_sim *sim;
+    struct mpm_particles *s;
+    const struct mpm_body_def *body;
+    size_t p;
+};
+
+static bool place(void *context, const double *x, double volume) {
+    struct filling *f = context;
+    struct mpm_particles *s = f->s;
+    double v[MPM_MAX_DIM], v2 = 0;
+    mpm_velocity_at(&f->body->velocity, x, s->dim, v);
+    for (int d = 0; d < s->dim; d++) {
+        const size_t at = mpm_at(f->p, s->dim, d);
+        s->x[at] = x[d];
+        s->v[at] = v[d];
+        if (s->x0) {
+            s->x0[at] = x[d];
+        }
+        f->sim->c.min[d] = fmin(f->sim->c.min[d], x[d]);
+        f->sim->c.max[d] = fmax(f->sim->c.max[d], x[d]);
+        v2 += v[d] * v[d];
+    }
+    f->sim->c.v2_max = fmax(f->sim->c.v2_max, v2);
+    s->V0[f->p] = s->V[f->p] = volume;
+    f->p++;
+    return true;
+}
+
+static bool wants_x0(const struct mpm_def *def) {
+    bool wanted = def->wants_displacement;
+    for (size_t k = 0; k < def->n_probes; k++) {
+        wanted |= def->probes[k].kind == MPM_PROBE_DISPLACEMENT || def->probes[k].has_box ||
+                  (def->probes[k].kind != MPM_PROBE_ENERGY &&
+                   def->probes[k].field == MPM_FIELD_DISPLACEMENT);
+    }
+    return wanted;
+}
+
+static bool wants_J_raw(const struct mpm_def *def) {
+    bool wanted = def->wants_volume_ratio;
+    for (size_t k = 0; k < def->n_probes; k++) {
+        const struct mpm_probe_def *probe = &def->probes[k];
+        wanted |= probe->kind == MPM_PROBE_DRIFT || probe->field == MPM_FIELD_VOLUME_RATIO;
+    }
+    return wanted;
+}
+
+static bool wants_reaction(const struct mpm_def *def, size_t wall) {
+    for (size_t k = 0; k < def->n_probes; k++) {
+        if (def->probes[k].kind == MPM_PROBE_REACTION && def->probes[k].wall == (int)wall) {
+            return true;
+        }
+    }
+    return false;
+}
+
+// The schemes that the definition itself can come to use.
+static enum mpm_fbar_scheme widest_fbar(const struct mpm_def *def) {
+    enum mpm_fbar_scheme widest = def->settings.fbar.scheme;
+    for (size_t k = 0; k < def->n_stages; k++) {
+        const struct mpm_stage_def *s = &def->stages[k];
+        if ((s->states & MPM_SET_FBAR) && s->settings.fbar.scheme > widest) {
+            widest = s->settings.fbar.scheme;
+        }
+    }
+    return widest;
+}
+
+static bool create_sets(struct mpm_sim *sim) {
+    const struct mpm_def *def = sim->def;
+    for (size_t b = 0; b < sim->n_sets; b++) {
+        const struct mpm_body_def *body = &def->bodies[b];
+        const struct mpm_material_def *m = mpm_material_of(def, body->material, 0);
+        struct mpm_particles *s = &sim->sets[b];
+        *s = (struct mpm_particles){.first_id = (uint32_t)sim->n_particles,
+                                    .body = (int)b,
+                                    .dim = def->dimension,
+                                    .material = m->model,
+                                    .density = m->parameters[0],
+                                    .half = mpm_seed_half(body),
+                                    .inv_4_half = 0.25 / mpm_seed_half(body),
+                                    .wants_fbar = m->fbar};
+        memcpy(s->parameters, m->parameters, sizeof s->parameters);
+        const size_t n = mpm_seed(def, body, NULL, NULL);
+        if (!mpm_particles_create(s, n, wants_x0(def), wants_J_raw(def))) {
+            return false;
+        }
+        struct filling f = {.sim = sim, .s = s, .body = body};
+        mpm_seed(def, body, place, &f);
+        sim->n_particles += n;
+        const size_t chunks = (n + MPM_CHUNK - 1) / MPM_CHUNK;
+        sim->n_results = chunks > sim->n_results ? chunks : sim->n_results;
+    }
+    return true;
+}
+
+// Where a particle counts as having left the domain. uGIMP and linear walls hold nodes, not
+// particles: a particle pressed against one may sink past it by a fraction of its own size (2 % of
+// a cell was seen in the dam break), so where such a wall stands on the domain's edge, half a
+// particle more is allowed.
+static void set_exit(struct mpm_sim *sim) {
+    const struct mpm_def *def = sim->def;
+    double half = 0;
+    for (size_t b = 0; b < sim->n_sets; b++) {
+        half = fmax(half, sim->sets[b].half * def->cell);
+    }
+    for (int d = 0; d < def->dimension; d++) {
+        sim->exit_min[d] = def->domain_min[d];
+        sim->exit_max[d] = def->domain_max[d];
+    }
+    for (size_t k = 0; k < sim->n_walls; k++) {
+        const struct mpm_wall_def *w = &sim->walls[k].def;
+        if (sim->walls[k].folds) {
+            continue;
+        }
+        if (w->keeps_above && w->at - half < sim->exit_min[w->axis]) {
+            sim->exit_min[w->axis] = w->at - half;
+        }
+        if (!w->keeps_above && w->at + half > sim->exit_max[w->axis]) {
+            sim->exit_max[w->axis] = w->at + half;
+        }
+    }
+}
+
+static bool create_probes(struct mpm_sim *sim) {
+    const size_t n = sim->def->n_probes;
+    bool averages = false;
+    for (size_t k = 0; k < n; k++) {
+        averages |= sim->def->probes[k].average > 0;
+    }
+    sim->probe_set = calloc(n + 1, sizeof *sim->probe_set);
+    sim->probe_particle = calloc(n + 1, sizeof *sim->probe_particle);
+    sim->averages = averages ? calloc(n, sizeof *sim->averages) : NULL;
+    bool sorts = false;
+    for (size_t k = 0; k < n; k++) {
+        sorts |= sim->def->probes[k].kind == MPM_PROBE_EXTENT && sim->def->probes[k].quantile < 1;
+    }
+    sim->scratch = sorts ? calloc(sim->n_particles, sizeof *sim->scratch) : NULL;
+    if (!sim->probe_set || !sim->probe_particle || (averages && !sim->averages) ||
+        (sorts && !sim->scratch)) {
+        return false;
+    }
+    mpm_probes_find_particles(sim);
+    return true;
+}
+
+static void keep_first(void *context, const struct mpm_error *fault) {
+    struct mpm_error *first = context;
+    if (first && first->status == MPM_OK) {
+        *first = *fault;
+    }
+}
+
+enum mpm_status mpm_create(const struct mpm_def *def, struct mpm_sim **out, struct mpm_error *err) {
+    *out = NULL;
+    struct mpm_error first = {.status = MPM_OK};
+    if (mpm_check(def, keep_first, &first)) {
+        if (err) {
+            *err = first;
+        }
+        return first.status;
+    }
+    struct mpm_sim *sim = calloc(1, sizeof *sim);
+    if (!sim) {
+        return mpm_fail(err, MPM_ERR_MEMORY, "", "no memory for the simulation");
+    }
+    sim->def = def;
+    sim->kernels = mpm_kernels(def->dimension, def->basis);
+    sim->n_sets = def->n_bodies;
+    sim->sets = calloc(def->n_bodies, sizeof *sim->sets);
+    sim->walls = calloc(def->n_walls + 1, sizeof *sim->walls);
+    for (int d = 0; d < MPM_MAX_DIM; d++) {
+        sim->c.min[d] = INFINITY;
+        sim->c.max[d] = -INFINITY;
+    }
+    if (!sim->sets || !sim->walls || !mpm_grid_create(&sim->grid, def) || !create_sets(sim)) {
+        goto fail;
+    }
+    for (; sim->n_walls < def->n_walls; sim->n_walls++) {
+        if (!mpm_wall_create(&sim->walls[sim->n_walls], &def->walls[sim->n_walls], &sim->grid,
+                             def->basis, wants_reaction(def, sim->n_walls))) {
+            goto fail;
+        }
+    }
+    set_exit(sim);
+    sim->results = calloc(sim->n_results, sizeof *sim->results);
+    if (!sim->results || !create_probes(sim) || !mpm_provide_fbar(sim, widest_fbar(def))) {
+        goto fail;
+    }
+    sim->c.base = def->settings;
+    sim->c.end = def->stages[def->n_stages - 1].duration;
+    const double v2_max = sim->c.v2_max;
+    mpm_enter_stage(sim, 0);
+    sim->c.v2_max = def->stages[0].resets & MPM_RESET_VELOCITY ? 0 : v2_max;
+    for (size_t b = 0; b < sim->n_sets; b++) {
+        update_stress(&sim->sets[b]);
+    }
+    *out = sim;
+    return MPM_OK;
+fail:
+    mpm_fail(err, MPM_ERR_MEMORY, "", "no memory for the particles and %zu nodes",
+             sim->grid.n_nodes);
+    mpm_free(sim);
+    return MPM_ERR_MEMORY;
+}
+
+void mpm_free(struct mpm_sim *sim) {
+    if (!sim) {
+        return;
+    }
+    for (size_t b = 0; sim->sets && b < sim->n_sets; b++) {
+        mpm_particles_free(&sim->sets[b]);
+    }
+    for (size_t k = 0; sim->walls && k < sim->n_walls; k++) {
+        mpm_wall_free(&sim->walls[k]);
+    }
+    mpm_grid_free(&sim->grid);
+    free(sim->sets);
+    free(sim->walls);
+    free(sim->results);
+    free(sim->averages);
+    free(sim->probe_set);
+    free(sim->probe_particle);
+    free(sim->scratch);
+    free(sim);
+}
+
+// Bytes of a simulation of n[b] particles in body b.
+static size_t bytes_of(const struct mpm_def *def, const struct mpm_grid *grid, const size_t *n) {
+    const bool fbar = widest_fbar(def) != MPM_FBAR_OFF;
+    const int scalars = mpm_fbar_scalars(widest_fbar(def));
+    const int per_node =
+        MPM_NODE(def->dimension) + MPM_VELOCITY(def->dimension) + (fbar ? 1 + scalars : 0);
+    size_t bytes = grid->n_nodes * (size_t)per_node * sizeof(double);
+    for (size_t b = 0; b < def->n_bodies; b++) {
+        const struct mpm_material_def *m = &def->materials[def->bodies[b].material];
+        bytes += mpm_particles_bytes(m->model, def->dimension, n[b], wants_x0(def),
+                                     wants_J_raw(def), fbar && m->fbar);
+    }
+    return bytes;
+}
+
+void mpm_estimate(const struct mpm_def *def, struct mpm_estimate *out) {
+    *out = (struct mpm_estimate){0};
+    struct mpm_grid grid;
+    mpm_grid_layout(&grid, def);
+    out->nodes = grid.n_nodes;
+    size_t *n = calloc(def->n_bodies + 1, sizeof *n);
+    if (!n) {
+        return;
+    }
+    for (size_t b = 0; b < def->n_bodies; b++) {
+        n[b] = mpm_seed(def, &def->bodies[b], NULL, NULL);
+        out->particles += n[b];
+    }
+    out->bytes = bytes_of(def, &grid, n);
+    free(n);
+    double steps = 0;
+    for (size_t k = 0; k < def->n_stages; k++) {
+        const struct mpm_settings now = stage_settings(def, k, &def->settings);
+        out->dt_limit = mpm_def_dt_limit(def, k);
+        out->dt = now.dt > 0 ? now.dt : now.cfl / STABLE_CFL * out->dt_limit;
+        steps += ceil(def->stages[k].duration / out->dt * (1 - 1e-9));
+    }
+    out->steps = (uint64_t)steps;
+}
+
+// ---- Queries and changes
+// --------------------------------------------------------------------------
+
+bool mpm_finished(const struct mpm_sim *sim) {
+    return sim->c.stage + 1 == sim->def->n_stages && sim->c.time >= sim->c.end;
+}
+
+uint64_t mpm_step_count(const struct mpm_sim *sim) {
+    return sim->c.step;
+}
+
+double mpm_time(const struct mpm_sim *sim) {
+    return sim->c.time;
+}
+
+double mpm_end_time(const struct mpm_sim *sim) {
+    return sim->c.end;
+}
+
+double mpm_start_time(const struct mpm_sim *sim) {
+    return 0 - time_before_last(sim->def, 0);
+}
+
+size_t mpm_stage(const struct mpm_sim *sim) {
+    return sim->c.stage;
+}
+
+size_t mpm_n_particles(const struct mpm_sim *sim) {
+    return sim->n_particles;
+}
+
+size_t mpm_n_nodes(const struct mpm_sim *sim) {
+    return sim->grid.n_nodes;
+}
+
+size_t mpm_bytes(const struct mpm_sim *sim) {
+    size_t bytes = sim->grid.bytes;
+    for (size_t b = 0; b < sim->n_sets; b++) {
+        bytes += sim->sets[b].memory_bytes + sim->sets[b].fbar_bytes;
+    }
+    return bytes;
+}
+
+struct mpm_settings mpm_settings_now(const struct mpm_sim *sim) {
+    return sim->c.now;
+}
+
+enum mpm_status mpm_change(struct mpm_sim *sim, const struct mpm_settings *settings, unsigned which,
+                           struct mpm_error *err) {
+    struct mpm_settings now = sim->c.now;
+    overlay(&now, settings, which);
+    const enum mpm_status status = mpm_check_settings(
+        &now, "", sim->def->dimension, mpm_dt_limit(sim), sim->def->unstable_ok, err);
+    if (status) {
+        return status;
+    }
+    if (!mpm_provide_fbar(sim, now.fbar.scheme)) {
+        return mpm_fail(err, MPM_ERR_MEMORY, "/fbar", "no memory for what F-bar needs");
+    }
+    sim->c.now = now;
+    overlay(&sim->c.base, settings, which);
+    if (which & MPM_SET_TIME) {
+        sim->c.anchor_time = sim->c.time;
+        sim->c.steps_since_anchor = 0;
+    }
+    if (which & MPM_SET_GRAVITY) { // at once: a ramp that was under way ends
+        memcpy(sim->c.gravity_before, now.gravity, sizeof now.gravity);
+    }
+    return MPM_OK;
+}
+
+enum mpm_status mpm_change_end(struct mpm_sim *sim, double end, struct mpm_error *err) {
+    const bool last = sim->c.stage + 1 == sim->def->n_stages;
+    if (!(end > 0 && end < INFINITY) || (last && end < sim->c.time)) {
+        char actual[32];
+        snprintf(actual, sizeof actual, "%.9g", end);
+        return mpm_fail_value(err, MPM_ERR_RANGE, "/time/end", "a time not yet passed, s", actual,
+                              "the end must be above 0 and not before the present time, %.9g s",
+                              sim->c.time);
+    }
+    sim->c.end = end;
+    if (last) {
+        sim->c.stage_end = end;
+    }
+    return MPM_OK;
+}
+
+static const char *const phase_names[] = {
+#define X(code, text) text,
+    MPM_PHASE_LIST(X)
+#undef X
+};
+
+const char *mpm_phase_name(enum mpm_phase phase) {
+    return phase_names[phase];
+}
+
+double mpm_phase_seconds(const struct mpm_sim *sim, enum mpm_phase phase) {
+    return sim->phase_seconds[phase];
+}

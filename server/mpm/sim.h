@@ -1,0 +1,80 @@
+// The simulation's inside, shared by the files of the solver.
+#pragma once
+#include "server/mpm/boundary.h"
+#include "server/mpm/fbar.h"
+#include "server/mpm/transfer.h"
+
+#define MPM_CHUNK 1024 // particles of one unit of parallel work; never depends on the thread count
+#define MPM_AVERAGE_SLOTS 64 // points of a probe's running integral kept over its averaging window
+
+// Running integral of a probe's value over time, for its moving mean.
+struct mpm_average {
+    double integral[MPM_MAX_COMPONENTS];
+    size_t n, next; // points kept (at most MPM_AVERAGE_SLOTS + 1), place of the next
+    double time[MPM_AVERAGE_SLOTS + 1];
+    double at[MPM_AVERAGE_SLOTS + 1][MPM_MAX_COMPONENTS];
+};
+
+// All of the state that is neither particles nor grid: saved and restored as it is.
+struct mpm_clockwork {
+    uint64_t step;
+    size_t stage;
+    // time = anchor + steps_since * dt while dt is fixed, so that it does not gather round-off
+    double time, anchor_time, dt;
+    uint64_t steps_since_anchor;
+    double stage_begin, stage_end, end;        // s; end of the last stage
+    double kinetic_max;                        // J, largest of this stage
+    double gravity_before[MPM_MAX_DIM];        // m/s^2, where this stage's ramp starts
+    struct mpm_settings base;                  // the scene's settings, with the changes made since
+    struct mpm_settings now;                   // in force: the base with what the stage states
+    double external_work;                      // J
+    double min[MPM_MAX_DIM], max[MPM_MAX_DIM]; // m, bounding box of the particles
+    double v2_max;                             // (m/s)^2
+};
+
+struct mpm_sim {
+    const struct mpm_def *def; // borrowed
+    const struct mpm_kernels *kernels;
+    struct mpm_grid grid;
+    double exit_min[MPM_MAX_DIM], exit_max[MPM_MAX_DIM]; // m: a particle beyond them has left
+    size_t n_sets, n_walls, n_particles, n_results;
+    struct mpm_particles *sets; // one a body
+    struct mpm_wall *walls;
+    struct mpm_span_result *results; // one a chunk of the largest body
+    struct mpm_average *averages;    // (n_probes), NULL where no probe averages
+    size_t *probe_particle;          // (n_probes) set and particle of a probe at a point
+    size_t *probe_set;
+    double *scratch; // (n_particles), where a probe sorts
+    struct mpm_clockwork c;
+    double phase_seconds[MPM_N_PHASES];
+};
+
+// The material of a body with the patches of the stages up to and including `stage`.
+const struct mpm_material_def *mpm_material_of(const struct mpm_def *def, int material,
+                                               size_t stage);
+// Gravity in force at time t of the present stage, m/s^2.
+void mpm_gravity_at(const struct mpm_sim *sim, double t, double *g);
+// Fastest P-wave of the present materials, m/s; and the limit on dt that it sets with particles
+// moving at v_max (m/s).
+double mpm_wave_speed(const struct mpm_sim *sim);
+double mpm_dt_limit_at(double cell, double wave_speed, double v_max, double diffusivity, int dim);
+// The same for a stage of a definition, with the bodies' initial speeds.
+double mpm_def_dt_limit(const struct mpm_def *def, size_t stage);
+// Whether settings are in their bounds; `pointer` is the place of the settings, dt_limit in s.
+enum mpm_status mpm_check_settings(const struct mpm_settings *settings, const char *pointer,
+                                   int dim, double dt_limit, bool unstable_ok,
+                                   struct mpm_error *err);
+// Applies what stage `stage` states, removes and resets, and sets the clock to its start.
+void mpm_enter_stage(struct mpm_sim *sim, size_t stage);
+double mpm_kinetic_energy(const struct mpm_sim *sim);
+// The parameters that the stages up to the present one have set: after a state was loaded.
+void mpm_restore_stage(struct mpm_sim *sim);
+// Takes the memory that a scheme needs; what is taken stays. False when memory is short.
+bool mpm_provide_fbar(struct mpm_sim *sim, enum mpm_fbar_scheme scheme);
+// One field at one particle, as doubles (components); mean stress, Pa.
+void mpm_particle_field(const struct mpm_particles *s, size_t p, enum mpm_field field, double *out);
+double mpm_mean_stress(const struct mpm_particles *s, size_t p);
+// Finds the particles of the probes that follow one.
+void mpm_probes_find_particles(struct mpm_sim *sim);
+// Adds the present values to the running integrals of the probes that average.
+void mpm_probes_after_step(struct mpm_sim *sim, double dt);

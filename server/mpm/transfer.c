@@ -1,0 +1,365 @@
+// Particle-grid transfers: the plain scalar kernels, written once for every dimension and basis.
+//
+// They follow docs/method.md equation by equation and stay as the baseline that faster kernels are
+// checked against. Zhao, Jiang, Choo, eqs. 7-17; F-bar: their Algorithm 1, and docs/method.md
+// section 4 for the anchored scheme.
+#include "server/mpm/transfer.h"
+
+#include <stdint.h>
+
+#include "server/mpm/basis.h"
+
+#define BATCH 64 // particles whose velocity gradient is kept for one call of a material's rate part
+
+// The nodes that one particle reaches: first node, and weights by direction.
+struct stencil {
+    size_t first;
+    double w[MPM_MAX_DIM][MPM_MAX_SUPPORT], dw[MPM_MAX_DIM][MPM_MAX_SUPPORT];
+};
+
+MPM_KERNEL void stencil_at(struct stencil *t, const struct mpm_span *span, size_t p, const int dim,
+                           const enum mpm_basis basis) {
+    const struct mpm_grid *g = span->grid;
+    t->first = 0;
+    for (int d = 0; d < dim; d++) {
+        const double xi = (span->s->x[mpm_at(p, dim, d)] - g->origin[d]) * g->inv_h;
+        const int base =
+            mpm_weights(basis, xi, span->s->half, span->s->inv_4_half, t->w[d], t->dw[d]);
+        t->first += (size_t)base * g->stride[d];
+    }
+}
+
+// The nodes of a stencil lie in rows along the last direction, where they are neighbours in memory.
+// FOR_ROWS runs its body for each row, with its first node and the product of the weights (or, for
+// direction e, of the gradient's factors, per cell) of the other directions. All bounds are
+// constants.
+#define FOR_ROWS(dim, basis)                                                                       \
+    for (int a_ = 0; a_ < mpm_support(basis); a_++)                                                \
+        for (int b_ = 0; b_ < ((dim) == 3 ? mpm_support(basis) : 1); b_++)
+#define ROW_NODE(t, g, dim)                                                                        \
+    ((t).first + (size_t)a_ * (g)->stride[0] + ((dim) == 3 ? (size_t)b_ * (g)->stride[1] : 0))
+#define ROW_WEIGHT(t, dim) ((t).w[0][a_] * ((dim) == 3 ? (t).w[1][b_] : 1))
+#define ROW_GRADIENT(t, dim, e)                                                                    \
+    (((e) == 0 ? (t).dw[0][a_] : (t).w[0][a_]) * ((dim) == 2 ? 1                                   \
+                                                  : (e) == 1 ? (t).dw[1][b_]                       \
+                                                             : (t).w[1][b_]))
+
+MPM_KERNEL void p2g(const struct mpm_span *span, const int dim, const enum mpm_basis basis) {
+    const struct mpm_particles *s = span->s;
+    const struct mpm_grid *g = span->grid;
+    const int last = dim - 1;
+    for (size_t p = span->begin; p < span->end; p++) {
+        struct stencil t;
+        stencil_at(&t, span, p, dim, basis);
+        const double m = s->density * s->V0[p];
+        const double V_over_h = s->V[p] * g->inv_h;
+        double mv[3], V_sigma[6];
+        for (int d = 0; d < dim; d++) {
+            mv[d] = m * s->v[mpm_at(p, dim, d)];
+        }
+        for (int k = 0; k < MPM_SYM(dim); k++) {
+            V_sigma[k] = V_over_h * s->sigma[mpm_at(p, MPM_SYM(dim), k)];
+        }
+        FOR_ROWS(dim, basis) {
+            double *row = g->node + ROW_NODE(t, g, dim) * MPM_NODE(dim);
+            const double w_row = ROW_WEIGHT(t, dim), m_row = w_row * m;
+            double mv_row[3], f_w[3], f_dw[3]; // force = f_w w + f_dw dw along the row
+            for (int d = 0; d < dim; d++) {
+                mv_row[d] = w_row * mv[d];
+                f_dw[d] = -V_sigma[mpm_sym_index(d, last)] * w_row;
+                f_w[d] = 0;
+                for (int e = 0; e < last; e++) {
+                    f_w[d] -= V_sigma[mpm_sym_index(d, e)] * ROW_GRADIENT(t, dim, e);
+                }
+            }
+            for (int c = 0; c < mpm_support(basis); c++) {
+                double *node = row + c * MPM_NODE(dim);
+                const double w = t.w[last][c], dw = t.dw[last][c];
+                node[0] += w * m_row;
+                for (int d = 0; d < dim; d++) {
+                    node[1 + d] += w * mv_row[d];
+                    node[1 + dim + d] += w * f_w[d] + dw * f_dw[d];
+                }
+            }
+        }
+    }
+}
+
+static struct mpm_span_result empty_result(void) {
+    return (struct mpm_span_result){
+        .min = {INFINITY, INFINITY, INFINITY},
+        .max = {-INFINITY, -INFINITY, -INFINITY},
+        .bad = SIZE_MAX,
+    };
+}
+
+static void fault(struct mpm_span_result *r, size_t p, enum mpm_status status, double value) {
+    if (r->bad == SIZE_MAX) {
+        r->bad = p;
+        r->status = status;
+        r->value = value;
+    }
+}
+
+// Stress and position of particles whose deformation is final: eqs. 9 and 17. The position is
+// checked by the step that joins the results: what it finds out of the domain or not finite fails
+// the step.
+MPM_KERNEL void finish(const struct mpm_span *span, size_t begin, size_t end,
+                       struct mpm_span_result *r, double (*dx)[3], const int dim) {
+    struct mpm_particles *s = span->s;
+    s->material->stress[dim - 2](s, begin, end);
+    for (size_t p = begin; p < end; p++) {
+        const double m = s->density * s->V0[p];
+        for (int d = 0; d < dim; d++) {
+            double *x = &s->x[mpm_at(p, dim, d)];
+            const double step = dx ? dx[p - begin][d] : s->dx[mpm_at(p, dim, d)];
+            *x += step;
+            r->mass_dx[d] += m * step;
+            r->min[d] = *x < r->min[d] ? *x : r->min[d];
+            r->max[d] = *x > r->max[d] ? *x : r->max[d];
+            if (!(fabs(*x) < INFINITY)) {
+                fault(r, p, MPM_ERR_NOT_FINITE, *x);
+            }
+        }
+    }
+}
+
+MPM_KERNEL void g2p(const struct mpm_span *span, struct mpm_span_result *result, const int dim,
+                    const enum mpm_basis basis, const enum mpm_kinematics kinematics) {
+    struct mpm_particles *s = span->s;
+    const struct mpm_grid *g = span->grid;
+    const int last = dim - 1;
+    const bool fbar = span->fbar;
+    struct mpm_span_result r = empty_result();
+    double L[BATCH][9], dx[BATCH][3];
+    for (size_t begin = span->begin; begin < span->end; begin += BATCH) {
+        const size_t end = begin + BATCH < span->end ? begin + BATCH : span->end;
+        for (size_t p = begin; p < end; p++) {
+            struct stencil t;
+            stencil_at(&t, span, p, dim, basis);
+            double v_pic[3] = {0}, dv[3] = {0}, *l = L[p - begin];
+            for (int k = 0; k < dim * dim; k++) {
+                l[k] = 0;
+            }
+            FOR_ROWS(dim, basis) {
+                const double *row = g->velocity + ROW_NODE(t, g, dim) * MPM_VELOCITY(dim);
+                const double w_row = ROW_WEIGHT(t, dim);
+                double v_w[3] = {0}, v_dw[3] = {0}, dv_w[3] = {0}; // sums along the row
+                for (int c = 0; c < mpm_support(basis); c++) {
+                    const double *v = row + c * MPM_VELOCITY(dim);
+                    for (int d = 0; d < dim; d++) {
+                        v_w[d] += t.w[last][c] * v[d];
+                        v_dw[d] += t.dw[last][c] * v[d];
+                        dv_w[d] += t.w[last][c] * v[dim + d];
+                    }
+                }
+                for (int d = 0; d < dim; d++) {
+                    v_pic[d] += w_row * v_w[d];
+                    dv[d] += w_row * dv_w[d];
+                    l[d * dim + last] += w_row * v_dw[d];
+                    for (int e = 0; e < last; e++) {
+                        l[d * dim + e] += ROW_GRADIENT(t, dim, e) * v_w[d];
+                    }
+                }
+            }
+            double v2 = 0;
+            for (int d = 0; d < dim; d++) { // eqs. 11-13
+                double *v = &s->v[mpm_at(p, dim, d)];
+                *v = span->blend * (*v + dv[d]) + (1 - span->blend) * v_pic[d];
+                v2 += *v * *v;
+                dx[p - begin][d] = span->dt * v_pic[d];
+            }
+            if (!(v2 < INFINITY)) {
+                fault(&r, p, MPM_ERR_NOT_FINITE, v2);
+            }
+            r.v2_max = v2 > r.v2_max ? v2 : r.v2_max;
+            double D[9]; // the relative deformation gradient less 1
+            for (int k = 0; k < dim * dim; k++) {
+                l[k] *= g->inv_h;
+                D[k] = span->dt * l[k];
+            }
+            const double dJ_minus_one = mpm_det_minus_one(D, dim);
+            double ratio;
+            if (kinematics == MPM_KEEPS_F) { // eq. 14
+                double F[9], F_new[9];
+                for (int k = 0; k < dim * dim; k++) {
+                    F[k] = s->F[mpm_at(p, dim * dim, k)];
+                }
+                for (int i = 0; i < dim; i++) {
+                    for (int j = 0; j < dim; j++) {
+                        double sum = 0;
+                        for (int k = 0; k < dim; k++) {
+                            sum += D[i * dim + k] * F[k * dim + j];
+                        }
+                        F_new[i * dim + j] = F[i * dim + j] + sum;
+                    }
+                }
+                for (int k = 0; k < dim * dim; k++) {
+                    s->F[mpm_at(p, dim * dim, k)] = F_new[k];
+                }
+                ratio = mpm_det(F_new, dim);
+            } else {
+                s->Jbar[p] += s->Jbar[p] * dJ_minus_one;
+                ratio = s->Jbar[p];
+                if (s->J_raw) {
+                    s->J_raw[p] += s->J_raw[p] * dJ_minus_one;
+                }
+            }
+            if (fbar) {
+                s->dJ[p] = 1 + dJ_minus_one;
+                for (int d = 0; d < dim; d++) {
+                    s->dx[mpm_at(p, dim, d)] = dx[p - begin][d];
+                }
+            } else {
+                s->V[p] += s->V[p] * dJ_minus_one; // eq. 15
+                if (!(ratio > 0 && s->V[p] > 0)) {
+                    fault(&r, p, MPM_ERR_VOLUME, ratio > 0 ? s->V[p] / s->V0[p] : ratio);
+                }
+            }
+        }
+        if (s->material->rate_stress[dim - 2]) {
+            s->material->rate_stress[dim - 2](s, begin, end, L);
+        }
+        if (!fbar) {
+            finish(span, begin, end, &r, dx, dim);
+        }
+    }
+    *result = r;
+}
+
+// Algorithm 1, step 3, with the weights and the volume of time n. The trial ratio Jbar^n dJ is
+// already the ratio in use: g2p has applied the plain increment to the deformation.
+MPM_KERNEL void fbar_scatter(const struct mpm_span *span, const int dim, const enum mpm_basis basis,
+                             const enum mpm_fbar_scheme scheme) {
+    const struct mpm_particles *s = span->s;
+    const struct mpm_grid *g = span->grid;
+    const size_t stride = scheme == MPM_FBAR_ANCHORED ? 3 : 2;
+    for (size_t p = span->begin; p < span->end; p++) {
+        struct stencil t;
+        stencil_at(&t, span, p, dim, basis);
+        const double V = s->V[p], trial = mpm_ratio_in_use(s, p);
+        double a = V * trial, b = 0;
+        if (scheme == MPM_FBAR_ANCHORED) {
+            a = V * s->dJ[p];
+            b = (1 - span->a) * V * trial + span->a * a * (V / s->V0[p]);
+        }
+        FOR_ROWS(dim, basis) {
+            double *row = g->fbar + ROW_NODE(t, g, dim) * stride;
+            const double w_row = ROW_WEIGHT(t, dim);
+            for (int c = 0; c < mpm_support(basis); c++) {
+                double *node = row + (size_t)c * stride;
+                const double w = w_row * t.w[dim - 1][c];
+                node[0] += w * V;
+                node[1] += w * a;
+                if (scheme == MPM_FBAR_ANCHORED) {
+                    node[2] += w * b;
+                }
+            }
+        }
+    }
+}
+
+MPM_KERNEL void fbar_finish(const struct mpm_span *span, struct mpm_span_result *result,
+                            const int dim, const enum mpm_basis basis,
+                            const enum mpm_fbar_scheme scheme) {
+    struct mpm_particles *s = span->s;
+    const struct mpm_grid *g = span->grid;
+    const size_t stride = scheme == MPM_FBAR_ANCHORED ? 3 : 2;
+    struct mpm_span_result r = empty_result();
+    for (size_t p = span->begin; p < span->end; p++) {
+        struct stencil t;
+        stencil_at(&t, span, p, dim, basis);
+        double A = 0, B = 0;
+        FOR_ROWS(dim, basis) {
+            const double *row = g->fbar + ROW_NODE(t, g, dim) * stride;
+            double A_row = 0, B_row = 0;
+            for (int c = 0; c < mpm_support(basis); c++) {
+                const double *node = row + (size_t)c * stride;
+                A_row += t.w[dim - 1][c] * node[1];
+                if (scheme == MPM_FBAR_ANCHORED) {
+                    B_row += t.w[dim - 1][c] * node[2];
+                }
+            }
+            A += ROW_WEIGHT(t, dim) * A_row;
+            B += ROW_WEIGHT(t, dim) * B_row;
+        }
+        const double trial = mpm_ratio_in_use(s, p);
+        const double ratio = scheme == MPM_FBAR_ANCHORED ? B : A;
+        if (!(trial > 0 && ratio > 0)) {
+            fault(&r, p, MPM_ERR_VOLUME, trial > 0 ? ratio : trial);
+        }
+        if (scheme == MPM_FBAR_ANCHORED) {
+            double dx2 = 0;
+            for (int d = 0; d < dim; d++) {
+                const double dx = s->dx[mpm_at(p, dim, d)];
+                dx2 += dx * dx;
+            }
+            const double reach = span->C * sqrt(dx2) * g->inv_h, beta = reach < 1 ? reach : 1;
+            s->V[p] = (1 - beta) * s->V[p] * A + beta * s->V0[p] * ratio;
+        } else if (s->Jbar) {
+            s->V[p] *= s->dJ[p] * ratio / trial; // a fluid's volume follows Jbar
+        } else {
+            s->V[p] *= s->dJ[p]; // eq. 15: forces use the unaveraged volume
+        }
+        if (!(s->V[p] > 0)) {
+            fault(&r, p, MPM_ERR_VOLUME, s->V[p] / s->V0[p]);
+        }
+        if (s->Jbar) {
+            s->Jbar[p] = ratio;
+        } else { // Algorithm 1, step 4, applied to the trial F instead of to dF
+            const double q = ratio / trial, scale = dim == 2 ? sqrt(q) : cbrt(q);
+            for (int k = 0; k < dim * dim; k++) {
+                s->F[mpm_at(p, dim * dim, k)] *= scale;
+            }
+        }
+    }
+    finish(span, span->begin, span->end, &r, NULL, dim);
+    *result = r;
+}
+
+// ---- The table
+// ------------------------------------------------------------------------------------
+
+#define KERNELS(X)                                                                                 \
+    X(2, LINEAR)                                                                                   \
+    X(2, GIMP) X(2, BSPLINE2) X(2, BSPLINE3) X(3, LINEAR) X(3, GIMP) X(3, BSPLINE2) X(3, BSPLINE3)
+
+#define DEFINE(D, B)                                                                               \
+    static void p2g_##D##d_##B(const struct mpm_span *span) {                                      \
+        p2g(span, D, MPM_##B);                                                                     \
+    }                                                                                              \
+    static void g2p_##D##d_##B(const struct mpm_span *span, struct mpm_span_result *result) {      \
+        if (span->s->material->kinematics == MPM_KEEPS_F) {                                        \
+            g2p(span, result, D, MPM_##B, MPM_KEEPS_F);                                            \
+        } else {                                                                                   \
+            g2p(span, result, D, MPM_##B, MPM_KEEPS_J);                                            \
+        }                                                                                          \
+    }                                                                                              \
+    static void scatter_zhao_##D##d_##B(const struct mpm_span *span) {                             \
+        fbar_scatter(span, D, MPM_##B, MPM_FBAR_ZHAO);                                             \
+    }                                                                                              \
+    static void scatter_anchored_##D##d_##B(const struct mpm_span *span) {                         \
+        fbar_scatter(span, D, MPM_##B, MPM_FBAR_ANCHORED);                                         \
+    }                                                                                              \
+    static void finish_zhao_##D##d_##B(const struct mpm_span *span,                                \
+                                       struct mpm_span_result *result) {                           \
+        fbar_finish(span, result, D, MPM_##B, MPM_FBAR_ZHAO);                                      \
+    }                                                                                              \
+    static void finish_anchored_##D##d_##B(const struct mpm_span *span,                            \
+                                           struct mpm_span_result *result) {                       \
+        fbar_finish(span, result, D, MPM_##B, MPM_FBAR_ANCHORED);                                  \
+    }
+KERNELS(DEFINE)
+
+#define ENTRY(D, B)                                                                                \
+    [(D - 2) * MPM_N_BASES + MPM_##B] = {                                                          \
+        .p2g = p2g_##D##d_##B,                                                                     \
+        .g2p = g2p_##D##d_##B,                                                                     \
+        .fbar_scatter = {NULL, scatter_zhao_##D##d_##B, scatter_anchored_##D##d_##B},              \
+        .fbar_finish = {NULL, finish_zhao_##D##d_##B, finish_anchored_##D##d_##B},                 \
+    },
+static const struct mpm_kernels table[] = {KERNELS(ENTRY)};
+
+const struct mpm_kernels *mpm_kernels(int dim, enum mpm_basis basis) {
+    return &table[(dim - 2) * MPM_N_BASES + (int)basis];
+}
