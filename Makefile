@@ -28,6 +28,7 @@ VERSION = 0.1.0
 WARN = -Wall -Wextra -Wpedantic -Wshadow -Wstrict-prototypes -Wmissing-prototypes -Wvla
 CFLAGS.release = -O3 -g
 CFLAGS.debug = -O0 -g3
+CFLAGS.clang = -O2 -g
 CFLAGS.asan = -O1 -g -fsanitize=address,undefined -fno-sanitize-recover=all -fno-omit-frame-pointer
 CFLAGS.tsan = -O1 -g -fsanitize=thread
 CFLAGS.coverage = -O0 -g --coverage
@@ -52,11 +53,12 @@ SCENES = $(sort $(wildcard scenes/*.json))
 
 obj = $(patsubst %.c,$(B)/obj/%.o,$(1))
 
-.PHONY: all deps libmpm demo check check-unit check-physics check-api check-long clean help format tidy bench
+.PHONY: all deps deps-long libmpm demo check check-all check-layers check-unit check-physics check-api \
+	check-cli check-asan check-clang check-long install uninstall format clean help
 .DELETE_ON_ERROR:
 .SECONDARY:
 
-all: build/fbard build/fbar
+all: build/fbard build/fbar ## build everything
 
 # build/fbard and build/fbar are the release programs; other variants stay in their own folder.
 build/fbard: $(B)/fbard
@@ -64,7 +66,7 @@ build/fbard: $(B)/fbard
 build/fbar: $(B)/fbar
 	$(Q)cp $< $@.new && mv $@.new $@
 
-libmpm: $(B)/libmpm.a
+libmpm: $(B)/libmpm.a ## the solver library alone: needs a compiler and nothing else
 
 $(B)/libmpm.a: $(call obj,$(MPM_SRC))
 	$(call say,AR,$@)
@@ -113,18 +115,76 @@ $(B)/tests/%: $(B)/obj/tests/%.o $(SERVER_OBJ) $(call obj,$(PROTO_SRC)) $(B)/lib
 	@mkdir -p $(@D)
 	$(Q)$(CC) $(ALL_LDFLAGS) -pthread $(OPENMP) $^ $(call pc_libs,$(SERVER_LIBS) cmocka) -lm -o $@
 
-check-unit: $(UNIT)
-	$(Q)set -e; for t in $^; do echo "== $$t"; $$t; done
-check-physics: $(PHYSICS)
+## ---- Checks ----
+
+deps: ## install what is missing (Debian packages; as root or with sudo)
+	@missing=; for p in $(PACKAGES); do \
+	  dpkg-query -W -f='$${Status}' $$p 2>/dev/null | grep -q 'ok installed' || missing="$$missing $$p"; done; \
+	if [ -n "$$missing" ]; then \
+	  echo "installing:$$missing"; as=; [ "$$(id -u)" = 0 ] || as=sudo; \
+	  $$as apt-get update -qq && \
+	  DEBIAN_FRONTEND=noninteractive $$as apt-get install -y -qq --no-install-recommends $$missing >/dev/null; fi
+
+deps-long: deps
+	@$(MAKE) --no-print-directory deps PACKAGES="$(PACKAGES_LONG)"
+
+# Everything that a commit must pass. deps first, alone: what follows asks pkg-config.
+check: deps ## build and run all tests (installs what is missing)
+	@$(MAKE) --no-print-directory check-all
+
+check-all: all
+	$(Q)$(MAKE) --no-print-directory check-layers check-unit check-physics check-api check-cli
+	$(Q)$(MAKE) --no-print-directory check-asan
+
+check-layers: all
+	$(Q)tests/layers.sh
+
+check-unit: $(UNIT) ## cmocka tests of every module
 	$(Q)set -e; for t in $^; do echo "== $$t"; $$t; done
 
-format:
+check-physics: $(PHYSICS) ## the solver against exact solutions and published values
+	$(Q)set -e; for t in $^; do echo "== $$t"; $$t; done
+
+PYTEST = $(PYTHON) -m pytest -q -p no:cacheprovider
+
+check-api: all ## black-box tests of the daemon
+	$(Q)FBARD=$(CURDIR)/$(B)/fbard FBAR=$(CURDIR)/$(B)/fbar $(PYTEST) tests/api
+
+check-cli: all ## black-box tests of the client
+	$(Q)FBARD=$(CURDIR)/$(B)/fbard FBAR=$(CURDIR)/$(B)/fbar $(PYTEST) tests/cli
+
+# The same unit and API tests under AddressSanitizer and UBSan.
+check-asan:
+	$(Q)$(MAKE) --no-print-directory VARIANT=asan build/asan/fbard build/asan/fbar check-unit
+	$(Q)FBARD=$(CURDIR)/build/asan/fbard FBAR=$(CURDIR)/build/asan/fbar $(PYTEST) tests/api
+
+check-clang: ## warnings and unit tests with clang 14
+	$(Q)$(MAKE) --no-print-directory CC=clang-14 VARIANT=clang OPENMP=-fopenmp=libomp CFLAGS=-Werror \
+	  build/clang/fbard build/clang/fbar check-unit
+
+check-long: deps-long ## the longer verification: minutes to hours
+	@FBARD_LONG=1 $(MAKE) --no-print-directory check-all check-clang
+
+## ---- Use ----
+
+demo: deps ## the paper's dam break, F-bar on and off: pictures in build/demo (under 4 minutes)
+	@$(MAKE) --no-print-directory all
+	@scenes/demo.sh
+
+install: all ## into PREFIX (default /usr/local), under DESTDIR
+	install -d $(DESTDIR)$(PREFIX)/bin
+	install build/fbard build/fbar $(DESTDIR)$(PREFIX)/bin
+
+uninstall:
+	rm -f $(DESTDIR)$(PREFIX)/bin/fbard $(DESTDIR)$(PREFIX)/bin/fbar
+
+format: ## clang-format over all sources
 	clang-format -i $(shell git ls-files '*.c' '*.h')
 
-clean:
+clean: ## remove build/
 	rm -rf build
 
-help:
-	@sed -n 's/^\([a-z][a-z-]*\):.*## \(.*\)/  \1\t\2/p' Makefile
+help: ## this list
+	@sed -n 's/^\([a-z][a-z-]*\):.*## \(.*\)/  \1\t\2/p' Makefile | expand -t 18
 
 -include $(shell find build -name '*.d' 2>/dev/null)

@@ -120,7 +120,7 @@ static void fold(struct mpm_wall *w, struct mpm_grid *g, const double *gravity, 
     const size_t stride = g->stride[axis];
     FOR_COLUMNS(w, g, column, k) {
         double *ghost = g->node + (column + (size_t)w->ghost * stride) * MPM_NODE(dim);
-        double *plane = g->node + (column + (size_t)w->plane * stride) * MPM_NODE(dim);
+        const double *plane = g->node + (column + (size_t)w->plane * stride) * MPM_NODE(dim);
         double *inner = g->node + (column + (size_t)w->inner * stride) * MPM_NODE(dim);
         if (w->open) {
             // Leaves the wall if, left alone, the node on it would move away.
@@ -144,8 +144,6 @@ static void fold(struct mpm_wall *w, struct mpm_grid *g, const double *gravity, 
                 // that the grid update adds for its mass is taken back twice.
                 *p += 2 * m_ghost * v_wall;
                 *f -= 2 * m_ghost * gravity[d];
-                plane[1 + d] = plane[0] * v_wall;
-                plane[1 + dim + d] = -plane[0] * gravity[d];
             }
         }
         inner[0] += m_ghost;
@@ -223,8 +221,9 @@ static void apply_folded(struct mpm_wall *w, struct mpm_grid *g) {
             ghost[d] = s * inner[d] + (s < 0 ? 2 * v_wall : 0);
             ghost[dim + d] = s * inner[dim + d];
             if (s < 0) {
+                // FLIP sees the increment from the velocity before the condition, as everywhere.
+                plane[dim + d] += v_wall - plane[d];
                 plane[d] = v_wall;
-                plane[dim + d] = 0;
             }
         }
         // What has come to lie beyond the image's reach is held as by a direct condition.

@@ -1,5 +1,5 @@
 // One explicit time step, update stress last: Zhao, Jiang, Choo, section 2.2 and Algorithm 1.
-// The stages below are those of docs/method.md, in its order and with its equation numbers.
+// The stages below are those of docs/method.md, in its order; equation numbers are the paper's.
 #include <stdint.h>
 #include <stdio.h>
 #include <string.h>
@@ -9,7 +9,7 @@
 #define UNSTABLE_CFL                                                                               \
     1.0 // no basis is stable at dt >= 0.9 h/c (docs/method.md): beyond this it is not tried
 
-// eqs. 4-5: nodal velocities. Damping acts on the total force, before boundary conditions; FLIP's
+// eq. 9: nodal velocities. Damping acts on the total force, before boundary conditions; FLIP's
 // increment is taken from v^n before boundary conditions.
 MPM_KERNEL void update_nodes(struct mpm_grid *grid, const double *gravity,
                              const struct mpm_settings *now, double dt, const int dim) {
@@ -191,7 +191,7 @@ enum mpm_status mpm_step(struct mpm_sim *sim, struct mpm_error *err) {
     mpm_gravity_at(sim, sim->c.time, gravity);
     double clock = now_or_zero(sim);
 
-    // P2G, eqs. 1-3
+    // P2G, eqs. 7, 8, 10
     const bool any_fbar = now->fbar.scheme != MPM_FBAR_OFF;
     sim->grid.fbar_stride = 1 + mpm_fbar_scalars(now->fbar.scheme);
     mpm_grid_set_window(&sim->grid, sim->c.min, sim->c.max);
@@ -203,7 +203,7 @@ enum mpm_status mpm_step(struct mpm_sim *sim, struct mpm_error *err) {
     }
     charge(sim, MPM_PHASE_P2G, &clock);
 
-    // Grid, eqs. 4-5
+    // Grid, eq. 9, and boundary conditions
     mpm_walls_fold(sim->walls, sim->n_walls, &sim->grid, gravity, dt);
     if (dim == 2) {
         update_nodes(&sim->grid, gravity, now, dt, 2);
@@ -213,7 +213,7 @@ enum mpm_status mpm_step(struct mpm_sim *sim, struct mpm_error *err) {
     mpm_walls_apply(sim->walls, sim->n_walls, &sim->grid, dt);
     charge(sim, MPM_PHASE_GRID, &clock);
 
-    // G2P, eqs. 6-9
+    // G2P, eqs. 11-17
     struct mpm_span_result found = {.min = {INFINITY, INFINITY, INFINITY},
                                     .max = {-INFINITY, -INFINITY, -INFINITY},
                                     .bad = SIZE_MAX};
@@ -228,7 +228,7 @@ enum mpm_status mpm_step(struct mpm_sim *sim, struct mpm_error *err) {
     }
     charge(sim, MPM_PHASE_G2P, &clock);
 
-    // F-bar, eqs. 10-13: Algorithm 1, steps 3 and 4
+    // F-bar, eqs. 19-27: Algorithm 1, steps 3 to 5
     if (any_fbar) {
         const enum mpm_fbar_scheme scheme = now->fbar.scheme;
         for (size_t b = 0; b < sim->n_sets; b++) {

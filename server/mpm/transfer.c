@@ -44,6 +44,7 @@ MPM_KERNEL void stencil_at(struct stencil *t, const struct mpm_span *span, size_
                                                   : (e) == 1 ? (t).dw[1][b_]                       \
                                                              : (t).w[1][b_]))
 
+// eqs. 7, 8, 10. The internal force is -sum_p V sigma grad w.
 MPM_KERNEL void p2g(const struct mpm_span *span, const int dim, const enum mpm_basis basis) {
     const struct mpm_particles *s = span->s;
     const struct mpm_grid *g = span->grid;

@@ -24,14 +24,14 @@ struct mpm_span_result {
 };
 
 struct mpm_kernels {
-    // eq. 1-3: mass, momentum and internal force to the grid.
+    // eqs. 7, 8, 10: mass, momentum and internal force to the grid.
     void (*p2g)(const struct mpm_span *span);
-    // eq. 6-9: velocity, and the deformation with the plain increment; then, where F-bar is off,
+    // eqs. 11-17: velocity, and the deformation with the plain increment; then, where F-bar is off,
     // stress and position. With F-bar on it leaves dx and dJ for fbar_finish.
     void (*g2p)(const struct mpm_span *span, struct mpm_span_result *result);
-    // eq. 10: V and V Jbar dJ (or the sums of the anchored scheme) to the grid.
+    // eq. 19, with the volume of time n: V and V Jbar dJ (or the sums of the anchored scheme) to the grid.
     void (*fbar_scatter[MPM_N_FBAR_SCHEMES])(const struct mpm_span *span);
-    // eq. 11-13: averaged ratio to the particles, deformation scaled to it; then stress and
+    // eqs. 20, 25: averaged ratio to the particles, deformation scaled to it; then stress and
     // position.
     void (*fbar_finish[MPM_N_FBAR_SCHEMES])(const struct mpm_span *span,
                                             struct mpm_span_result *result);
