@@ -41,7 +41,12 @@ bool mpm_field_present(const struct mpm_sim *sim, enum mpm_field field) {
     case MPM_FIELD_DISPLACEMENT:
         return sim->n_sets > 0 && sim->sets[0].x0 != NULL;
     case MPM_FIELD_PLASTIC_STRAIN:
-        return false; // no model here has any
+        for (size_t b = 0; b < sim->n_sets; b++) {
+            if (sim->sets[b].plastic_strain) {
+                return true;
+            }
+        }
+        return false;
     default:
         return true;
     }
@@ -109,6 +114,8 @@ void mpm_particle_field(const struct mpm_particles *s, size_t p, enum mpm_field 
         out[0] = (double)(s->first_id + p);
         break;
     case MPM_FIELD_PLASTIC_STRAIN:
+        out[0] = s->plastic_strain ? s->plastic_strain[p] : 0;
+        break;
     case MPM_N_FIELDS:
         out[0] = 0;
         break;

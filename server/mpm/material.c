@@ -3,11 +3,13 @@
 
 #include <string.h>
 
-extern const struct mpm_material mpm_material_neo_hookean, mpm_material_newtonian;
+extern const struct mpm_material mpm_material_neo_hookean, mpm_material_newtonian,
+    mpm_material_hencky_j2;
 
 static const struct mpm_material *const materials[] = {
     &mpm_material_neo_hookean,
     &mpm_material_newtonian,
+    &mpm_material_hencky_j2,
 };
 
 size_t mpm_material_count(void) {

@@ -10,13 +10,17 @@ struct mpm_particles;
 enum mpm_kinematics {
     MPM_KEEPS_F, // the deformation gradient
     MPM_KEEPS_J, // the volume ratio only (fluids)
+    MPM_KEEPS_B, // the elastic left Cauchy-Green tensor (plasticity)
 };
-#define MPM_N_KINEMATICS 2
 
 struct mpm_material {
     const char *name, *doc;
     enum mpm_kinematics kinematics;
     const struct mpm_parameter *parameters; // ends with a NULL key; the first is the density
+    bool plastic;                           // has an equivalent plastic strain
+    // Index of a parameter that does not go with the others, with the reason; -1 = none. NULL =
+    // none.
+    int (*conflict)(const double *parameters, const char **why);
     // P-wave speed, m/s, at rest.
     double (*wave_speed)(const double *parameters);
     // Largest kinematic viscosity, m^2/s, that limits dt; NULL = none.

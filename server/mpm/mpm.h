@@ -24,9 +24,9 @@
 #define MPM_WALL_LIST(X) X(FIXED, "fixed") X(SLIP, "slip") X(SEPARATE, "separate")
 #define MPM_PROBE_LIST(X)                                                                          \
     X(EXTENT, "extent")                                                                            \
-    X(DISPLACEMENT, "displacement") X(FIELD, "field") X(REACTION, "reaction")                      \
-        X(MAXIMUM, "maximum") X(MINIMUM, "minimum") X(MEAN, "mean") X(ENERGY, "energy")            \
-            X(MOMENTUM, "momentum") X(DRIFT, "drift")
+    X(DISPLACEMENT, "displacement")                                                                \
+    X(FIELD, "field") X(REACTION, "reaction") X(MAXIMUM, "maximum") X(MINIMUM, "minimum")          \
+        X(MEAN, "mean") X(ENERGY, "energy") X(MOMENTUM, "momentum") X(DRIFT, "drift")
 
 enum mpm_basis {
 #define X(code, text) MPM_##code,
@@ -104,6 +104,9 @@ struct mpm_material_def {
 enum mpm_shape_kind {
     MPM_SHAPE_BOX,        // min, max
     MPM_SHAPE_BALL,       // centre, radius: a disk in 2D, a sphere in 3D
+    MPM_SHAPE_POLYGON,    // points: (n_points, 2), a simple polygon in x and y; 2D
+    MPM_SHAPE_EXTRUDE,    // the same polygon from min[2] to max[2] in z; 3D
+    MPM_SHAPE_CYLINDER,   // from min to max along its axis, radius; 3D
     MPM_SHAPE_POINTS,     // points: (n_points, dimension + 1), position and volume of each particle
     MPM_SHAPE_UNION,      // of the children
     MPM_SHAPE_DIFFERENCE, // the first child less the others
@@ -184,7 +187,24 @@ struct mpm_stage_def {
     double gravity_ramp;      // s, linear from the gravity before the stage (0 before the first)
     unsigned resets;          // enum mpm_reset, done as the stage begins
     const bool *removes_wall; // (n_walls), or NULL
+    const bool *removes_load; // (n_loads), or NULL
     const struct mpm_material_def *materials; // (n_materials) from this stage on, or NULL
+};
+
+// A force on particles that stays with them. They are chosen in the reference configuration: those
+// of `body` that lie within one particle spacing of its outermost ones along an axis (or, with
+// `round`, of its innermost or outermost ones about `centre`), or those in a box.
+struct mpm_load_def {
+    const char *name;
+    int body;
+    bool has_box, round, max_side;
+    int axis; // of the extreme; of a round one in 3D, the axis of the cylinder about `centre`
+    double centre[MPM_MAX_DIM];
+    double box_min[MPM_MAX_DIM], box_max[MPM_MAX_DIM];
+    bool is_pressure;
+    double force[MPM_MAX_DIM]; // N in all (per metre of thickness in 2D), shared equally
+    double pressure; // Pa, onto the body, along its axis or radius as it moves; not of a box
+    double ramp;     // s, linear from 0 since the first step
 };
 
 struct mpm_probe_def {
@@ -211,10 +231,11 @@ struct mpm_def {
     enum mpm_basis basis;
     struct mpm_settings settings;
     bool unstable_ok; // accept a dt above the stability limit
-    size_t n_materials, n_bodies, n_walls, n_stages, n_probes;
+    size_t n_materials, n_bodies, n_walls, n_loads, n_stages, n_probes;
     const struct mpm_material_def *materials;
     const struct mpm_body_def *bodies;
     const struct mpm_wall_def *walls;
+    const struct mpm_load_def *loads;
     const struct mpm_stage_def *stages; // at least one
     const struct mpm_probe_def *probes;
     bool wants_displacement; // a frame will ask for it

@@ -9,7 +9,8 @@
 // One walk over all fields serves counting (base NULL) and carving.
 static size_t carve(struct mpm_particles *s, char *base, bool wants_x0, bool wants_J_raw) {
     const int dim = s->dim;
-    const bool fluid = s->material->kinematics == MPM_KEEPS_J;
+    const enum mpm_kinematics kept = s->material->kinematics;
+    const bool fluid = kept == MPM_KEEPS_J;
     const struct {
         double **field;
         int components;
@@ -19,7 +20,9 @@ static size_t carve(struct mpm_particles *s, char *base, bool wants_x0, bool wan
         {&s->V0, 1},
         {&s->V, 1},
         {&s->sigma, MPM_SYM(dim)},
-        {&s->F, fluid ? 0 : dim * dim},
+        {&s->F, kept == MPM_KEEPS_F ? dim * dim : 0},
+        {&s->b, kept == MPM_KEEPS_B ? MPM_SYM(dim) : 0},
+        {&s->plastic_strain, s->material->plastic ? 1 : 0},
         {&s->Jbar, fluid ? 1 : 0},
         {&s->x0, wants_x0 ? dim : 0},
         {&s->J_raw, fluid && wants_J_raw ? 1 : 0},
@@ -57,6 +60,9 @@ bool mpm_particles_create(struct mpm_particles *s, size_t n, bool wants_x0, bool
             for (int d = 0; d < s->dim; d++) {
                 s->F[mpm_at(p, s->dim * s->dim, d * s->dim + d)] = 1;
             }
+        }
+        for (int k = 0; s->b && k < 3; k++) {
+            s->b[mpm_at(p, MPM_SYM(s->dim), k)] = 1;
         }
         if (s->Jbar) {
             s->Jbar[p] = 1;

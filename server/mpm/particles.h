@@ -28,8 +28,10 @@ struct mpm_particles {
     double *V;     // (n) m^3, current volume; V/V0 is the volume ratio that forces use
     double *sigma; // (n, MPM_SYM(dim)) Pa, Cauchy stress
     double *F;     // (n, dim, dim) deformation gradient that the stress uses (solids)
-    double *Jbar;  // (n) volume ratio that the stress uses (fluids; a solid's is det F)
-    double *x0;    // (n, dim) m, reference position, where a displacement is asked for
+    double *b; // (n, MPM_SYM(dim)) elastic left Cauchy-Green tensor that the stress uses (plastic)
+    double *plastic_strain; // (n) equivalent plastic strain (plastic)
+    double *Jbar;           // (n) volume ratio that the stress uses (fluids; a solid's is det F)
+    double *x0;             // (n, dim) m, reference position, where a displacement is asked for
     double *J_raw; // (n) the unaveraged volume ratio of a fluid, where something asks for it
     double *dx;    // (n, dim) m, displacement of this step, while F-bar is on
     double *dJ;    // (n) det of this step's relative deformation gradient, while F-bar is on
@@ -41,10 +43,18 @@ static inline size_t mpm_at(size_t p, int n_components, int c) {
     return (p / MPM_BLOCK * (size_t)n_components + (size_t)c) * MPM_BLOCK + p % MPM_BLOCK;
 }
 
-// Volume ratio that the stress uses at particle p: det F, or Jbar of a fluid.
+// Volume ratio that the stress uses at particle p: det F; sqrt(det b), since plastic flow keeps the
+// volume; or Jbar of a fluid.
 static inline double mpm_ratio_in_use(const struct mpm_particles *s, size_t p) {
     if (s->Jbar) {
         return s->Jbar[p];
+    }
+    if (s->b) {
+        double b[6] = {0};
+        for (int k = 0; k < MPM_SYM(s->dim); k++) {
+            b[k] = s->b[mpm_at(p, MPM_SYM(s->dim), k)];
+        }
+        return sqrt(mpm_det_sym(b, s->dim));
     }
     double F[9] = {0};
     for (int k = 0; k < s->dim * s->dim; k++) {
@@ -53,6 +63,8 @@ static inline double mpm_ratio_in_use(const struct mpm_particles *s, size_t p) {
     return mpm_det(F, s->dim);
 }
 
+// Mean normal stress of particle p, Pa.
+double mpm_mean_stress(const struct mpm_particles *s, size_t p);
 // Takes one block of memory for `n` particles of the material and hands out the arrays: F = 1,
 // ratios 1, everything else 0. False when memory is short.
 bool mpm_particles_create(struct mpm_particles *s, size_t n, bool wants_x0, bool wants_J_raw);

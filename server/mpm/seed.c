@@ -22,17 +22,60 @@ static double snapped(double value, double origin, double unit) {
     return fabs(u - whole) < SNAP ? whole : u;
 }
 
+// 1 between two places, 0 on either, -1 beyond.
+static int between(double from, double to, double origin, double unit, double point) {
+    const double a = snapped(from, origin, unit), b = snapped(to, origin, unit);
+    return point < a || point > b ? -1 : point == a || point == b ? 0 : 1;
+}
+
+// The vertices are snapped, so with vertices on the half-spacing lattice every product below is
+// exact.
+static int polygon_side(const struct mpm_shape *shape, const struct lattice *l,
+                        const double *point) {
+    bool inside = false;
+    for (size_t i = 0, j = shape->n_points - 1; i < shape->n_points; j = i++) {
+        double a[2], b[2];
+        for (int d = 0; d < 2; d++) {
+            a[d] = snapped(shape->points[2 * j + (size_t)d], l->origin[d], l->unit) - point[d];
+            b[d] = snapped(shape->points[2 * i + (size_t)d], l->origin[d], l->unit) - point[d];
+        }
+        const double cross = a[0] * b[1] - a[1] * b[0];
+        const double length = hypot(b[0] - a[0], b[1] - a[1]);
+        const double dot = a[0] * b[0] + a[1] * b[1];
+        if (fabs(cross) <= SNAP * length && dot <= SNAP) {
+            return 0; // between the ends of this edge
+        }
+        if ((a[1] > 0) != (b[1] > 0)) { // the edge crosses the ray to +x on the one side of it
+            inside ^= (cross > 0) == (b[1] > a[1]);
+        }
+    }
+    return inside ? 1 : -1;
+}
+
+static int cylinder_side(const struct mpm_shape *shape, const struct lattice *l,
+                         const double *point) {
+    double axis[3], from[3], length2 = 0, along = 0, r2 = 0;
+    for (int d = 0; d < 3; d++) {
+        from[d] = point[d] - snapped(shape->min[d], l->origin[d], l->unit);
+        axis[d] = (shape->max[d] - shape->min[d]) / l->unit;
+        length2 += axis[d] * axis[d];
+        along += from[d] * axis[d];
+        r2 += from[d] * from[d];
+    }
+    const double length = sqrt(length2), z = along / length, radius = shape->radius / l->unit;
+    const double gap = radius * radius - (r2 - z * z);
+    const int across = fabs(gap) < SNAP * radius ? 0 : gap > 0 ? 1 : -1;
+    const int ends = fabs(z) < SNAP || fabs(z - length) < SNAP ? 0 : z > 0 && z < length ? 1 : -1;
+    return across < ends ? across : ends;
+}
+
 // Sign of how far the point is inside the shape: > 0 inside, 0 on the edge, < 0 outside.
 static int side(const struct mpm_shape *shape, const struct lattice *l, const double *point) {
     switch (shape->kind) {
     case MPM_SHAPE_BOX: {
         int least = 1;
         for (int d = 0; d < l->dim; d++) {
-            const double a = snapped(shape->min[d], l->origin[d], l->unit);
-            const double b = snapped(shape->max[d], l->origin[d], l->unit);
-            const int here = point[d] < a || point[d] > b     ? -1
-                             : point[d] == a || point[d] == b ? 0
-                                                              : 1;
+            const int here = between(shape->min[d], shape->max[d], l->origin[d], l->unit, point[d]);
             least = here < least ? here : least;
         }
         return least;
@@ -46,6 +89,15 @@ static int side(const struct mpm_shape *shape, const struct lattice *l, const do
         const double radius = snapped(shape->radius, 0, l->unit), gap = radius * radius - r2;
         return fabs(gap) < SNAP * radius ? 0 : gap > 0 ? 1 : -1;
     }
+    case MPM_SHAPE_POLYGON:
+        return polygon_side(shape, l, point);
+    case MPM_SHAPE_EXTRUDE: {
+        const int across = polygon_side(shape, l, point);
+        const int along = between(shape->min[2], shape->max[2], l->origin[2], l->unit, point[2]);
+        return across < along ? across : along;
+    }
+    case MPM_SHAPE_CYLINDER:
+        return cylinder_side(shape, l, point);
     case MPM_SHAPE_POINTS:
         return -1;
     case MPM_SHAPE_UNION: {
@@ -98,10 +150,30 @@ bool mpm_shape_bounds(const struct mpm_shape *shape, int dim, double *min, doubl
             max[d] = shape->centre[d] + shape->radius;
         }
         break;
+    case MPM_SHAPE_CYLINDER:
+        for (int d = 0; d < dim; d++) { // the axis, and a circle's reach across it
+            double length2 = 0;
+            for (int e = 0; e < dim; e++) {
+                length2 += (shape->max[e] - shape->min[e]) * (shape->max[e] - shape->min[e]);
+            }
+            const double a = shape->max[d] - shape->min[d];
+            const double reach = shape->radius * sqrt(fmax(0, 1 - a * a / length2));
+            min[d] = fmin(shape->min[d], shape->max[d]) - reach;
+            max[d] = fmax(shape->min[d], shape->max[d]) + reach;
+        }
+        break;
+    case MPM_SHAPE_POLYGON:
+    case MPM_SHAPE_EXTRUDE:
     case MPM_SHAPE_POINTS:
+        if (shape->kind == MPM_SHAPE_EXTRUDE) {
+            min[2] = shape->min[2];
+            max[2] = shape->max[2];
+        }
         for (size_t k = 0; k < shape->n_points; k++) {
-            for (int d = 0; d < dim; d++) {
-                const double x = shape->points[k * (size_t)(dim + 1) + (size_t)d];
+            const int given = shape->kind == MPM_SHAPE_POINTS ? dim : 2;
+            const size_t width = shape->kind == MPM_SHAPE_POINTS ? (size_t)dim + 1 : 2;
+            for (int d = 0; d < given; d++) {
+                const double x = shape->points[k * width + (size_t)d];
                 min[d] = fmin(min[d], x);
                 max[d] = fmax(max[d], x);
             }
@@ -162,6 +234,23 @@ double mpm_seed_bound(const struct mpm_def *def, const struct mpm_body_def *body
     return bound;
 }
 
+// Lattice points of a box, direction by direction: no need to visit them.
+static size_t count_box(const struct mpm_shape *box, const struct lattice *l, const long long *from,
+                        const long long *to) {
+    size_t count = 1;
+    for (int d = 0; d < l->dim; d++) {
+        const double a = snapped(box->min[d], l->origin[d], l->unit);
+        const double b = snapped(box->max[d], l->origin[d], l->unit);
+        size_t here = 0;
+        for (long long k = from[d]; k < to[d]; k++) {
+            const double point = (double)(2 * k + 1);
+            here += l->closed ? point >= a && point <= b : point > a && point < b;
+        }
+        count *= here;
+    }
+    return count;
+}
+
 size_t mpm_seed(const struct mpm_def *def, const struct mpm_body_def *body,
                 bool (*each)(void *context, const double *x, double volume), void *context) {
     const int dim = def->dimension;
@@ -187,6 +276,9 @@ size_t mpm_seed(const struct mpm_def *def, const struct mpm_body_def *body,
         from[d] = (long long)first[d];
         to[d] = (long long)last[d];
         volume *= spacing;
+    }
+    if (!each && body->shape.kind == MPM_SHAPE_BOX) {
+        return count_box(&body->shape, &l, from, to);
     }
     size_t count = 0;
     for (long long i = from[0]; i < to[0]; i++) {

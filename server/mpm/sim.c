@@ -65,7 +65,7 @@ double mpm_next_dt(const struct mpm_sim *sim) {
     const double dt = c->now.dt > 0 ? c->now.dt : c->now.cfl / STABLE_CFL * mpm_dt_limit(sim);
     const double left = c->stage_end - c->time;
     // Fit the last step to the end, but leave a whole step whole whatever round-off says.
-    return left < dt * (1 - 1e-6) ? left : dt;
+    return left > 0 && left < dt * (1 - 1e-6) ? left : dt;
 }
 
 void mpm_gravity_at(const struct mpm_sim *sim, double t, double *g) {
@@ -97,9 +97,8 @@ static void overlay(struct mpm_settings *on, const struct mpm_settings *from, un
     }
 }
 
-// The base settings with what the stage states.
-static struct mpm_settings stage_settings(const struct mpm_def *def, size_t stage,
-                                          const struct mpm_settings *base) {
+struct mpm_settings mpm_stage_settings(const struct mpm_def *def, size_t stage,
+                                       const struct mpm_settings *base) {
     struct mpm_settings now = *base;
     overlay(&now, &def->stages[stage].settings, def->stages[stage].states);
     return now;
@@ -147,6 +146,9 @@ static void reset(struct mpm_sim *sim, unsigned what) {
     for (size_t b = 0; b < sim->n_sets; b++) {
         struct mpm_particles *s = &sim->sets[b];
         for (size_t p = 0; p < s->n; p++) {
+            if ((what & MPM_RESET_PLASTIC_STRAIN) && s->plastic_strain) {
+                s->plastic_strain[p] = 0;
+            }
             for (int d = 0; d < s->dim; d++) {
                 const size_t at = mpm_at(p, s->dim, d);
                 if (what & MPM_RESET_VELOCITY) {
@@ -180,17 +182,24 @@ void mpm_enter_stage(struct mpm_sim *sim, size_t stage) {
     if (stage > 0) {
         mpm_gravity_at(sim, c->time, c->gravity_before);
     }
+    const double begin = -time_before_last(def, stage);
+    if (sim->averages && begin != c->time) { // no mean reaches over a jump of the clock
+        memset(sim->averages, 0, def->n_probes * sizeof *sim->averages);
+    }
     c->stage = stage;
-    c->stage_begin = c->time = c->anchor_time = -time_before_last(def, stage);
+    c->stage_begin = c->time = c->anchor_time = begin;
     c->stage_end = stage + 1 == def->n_stages ? c->end : -time_before_last(def, stage + 1);
     c->steps_since_anchor = 0;
     c->kinetic_max = 0;
-    c->now = stage_settings(def, stage, &c->base);
+    c->now = mpm_stage_settings(def, stage, &c->base);
     for (size_t k = 0; s->removes_wall && k < sim->n_walls; k++) {
         sim->walls[k].active &= !s->removes_wall[k];
         if (s->removes_wall[k]) {
             memset(sim->walls[k].reaction, 0, sizeof sim->walls[k].reaction);
         }
+    }
+    for (size_t k = 0; s->removes_load && k < sim->n_loads; k++) {
+        sim->loads[k].active &= !s->removes_load[k];
     }
     if (s->materials) {
         mpm_restore_stage(sim);
@@ -376,17 +385,34 @@ enum mpm_status mpm_create(const struct mpm_def *def, struct mpm_sim **out, stru
     sim->n_sets = def->n_bodies;
     sim->sets = calloc(def->n_bodies, sizeof *sim->sets);
     sim->walls = calloc(def->n_walls + 1, sizeof *sim->walls);
+    sim->loads = calloc(def->n_loads + 1, sizeof *sim->loads);
     for (int d = 0; d < MPM_MAX_DIM; d++) {
         sim->c.min[d] = INFINITY;
         sim->c.max[d] = -INFINITY;
     }
-    if (!sim->sets || !sim->walls || !mpm_grid_create(&sim->grid, def) || !create_sets(sim)) {
+    if (!sim->sets || !sim->walls || !sim->loads || !mpm_grid_create(&sim->grid, def) ||
+        !create_sets(sim)) {
         goto fail;
     }
     for (; sim->n_walls < def->n_walls; sim->n_walls++) {
         if (!mpm_wall_create(&sim->walls[sim->n_walls], &def->walls[sim->n_walls], &sim->grid,
                              def->basis, wants_reaction(def, sim->n_walls))) {
             goto fail;
+        }
+    }
+    for (; sim->n_loads < def->n_loads; sim->n_loads++) {
+        struct mpm_load *load = &sim->loads[sim->n_loads];
+        const struct mpm_load_def *q = &def->loads[sim->n_loads];
+        if (!mpm_load_create(load, q, &sim->sets[q->body])) {
+            goto fail;
+        }
+        if (load->n == 0) {
+            char pointer[256];
+            snprintf(pointer, sizeof pointer, "/loads/%s/select", q->name);
+            mpm_free(sim);
+            return mpm_fail_value(err, MPM_ERR_EMPTY, pointer, "at least one particle", "none",
+                                  "load '%s' chooses no particle of body '%s'", q->name,
+                                  def->bodies[q->body].name);
         }
     }
     set_exit(sim);
@@ -421,9 +447,13 @@ void mpm_free(struct mpm_sim *sim) {
     for (size_t k = 0; sim->walls && k < sim->n_walls; k++) {
         mpm_wall_free(&sim->walls[k]);
     }
+    for (size_t k = 0; sim->loads && k < sim->n_loads; k++) {
+        mpm_load_free(&sim->loads[k]);
+    }
     mpm_grid_free(&sim->grid);
     free(sim->sets);
     free(sim->walls);
+    free(sim->loads);
     free(sim->results);
     free(sim->averages);
     free(sim->probe_set);
@@ -464,7 +494,7 @@ void mpm_estimate(const struct mpm_def *def, struct mpm_estimate *out) {
     free(n);
     double steps = 0;
     for (size_t k = 0; k < def->n_stages; k++) {
-        const struct mpm_settings now = stage_settings(def, k, &def->settings);
+        const struct mpm_settings now = mpm_stage_settings(def, k, &def->settings);
         out->dt_limit = mpm_def_dt_limit(def, k);
         out->dt = now.dt > 0 ? now.dt : now.cfl / STABLE_CFL * out->dt_limit;
         steps += ceil(def->stages[k].duration / out->dt * (1 - 1e-9));

@@ -2,6 +2,7 @@
 #pragma once
 #include "server/mpm/boundary.h"
 #include "server/mpm/fbar.h"
+#include "server/mpm/load.h"
 #include "server/mpm/transfer.h"
 
 #define MPM_CHUNK 1024 // particles of one unit of parallel work; never depends on the thread count
@@ -37,9 +38,10 @@ struct mpm_sim {
     const struct mpm_kernels *kernels;
     struct mpm_grid grid;
     double exit_min[MPM_MAX_DIM], exit_max[MPM_MAX_DIM]; // m: a particle beyond them has left
-    size_t n_sets, n_walls, n_particles, n_results;
+    size_t n_sets, n_walls, n_loads, n_particles, n_results;
     struct mpm_particles *sets; // one a body
     struct mpm_wall *walls;
+    struct mpm_load *loads;
     struct mpm_span_result *results; // one a chunk of the largest body
     struct mpm_average *averages;    // (n_probes), NULL where no probe averages
     size_t *probe_particle;          // (n_probes) set and particle of a probe at a point
@@ -52,6 +54,9 @@ struct mpm_sim {
 // The material of a body with the patches of the stages up to and including `stage`.
 const struct mpm_material_def *mpm_material_of(const struct mpm_def *def, int material,
                                                size_t stage);
+// The base settings with what the stage states.
+struct mpm_settings mpm_stage_settings(const struct mpm_def *def, size_t stage,
+                                       const struct mpm_settings *base);
 // Gravity in force at time t of the present stage, m/s^2.
 void mpm_gravity_at(const struct mpm_sim *sim, double t, double *g);
 // Fastest P-wave of the present materials, m/s; and the limit on dt that it sets with particles
@@ -71,9 +76,8 @@ double mpm_kinetic_energy(const struct mpm_sim *sim);
 void mpm_restore_stage(struct mpm_sim *sim);
 // Takes the memory that a scheme needs; what is taken stays. False when memory is short.
 bool mpm_provide_fbar(struct mpm_sim *sim, enum mpm_fbar_scheme scheme);
-// One field at one particle, as doubles (components); mean stress, Pa.
+// One field at one particle, as doubles (components).
 void mpm_particle_field(const struct mpm_particles *s, size_t p, enum mpm_field field, double *out);
-double mpm_mean_stress(const struct mpm_particles *s, size_t p);
 // Finds the particles of the probes that follow one.
 void mpm_probes_find_particles(struct mpm_sim *sim);
 // Adds the present values to the running integrals of the probes that average.

@@ -8,7 +8,7 @@
 #define STATE_MAGIC 0x31746174534d504dULL // "MPMStat1"
 
 struct header {
-    uint64_t magic, bytes, n_sets, n_walls, n_probes, n_particles;
+    uint64_t magic, bytes, n_sets, n_walls, n_probes, n_stages, n_particles;
     int32_t dimension, basis;
 };
 
@@ -18,6 +18,7 @@ static struct header header_of(const struct mpm_sim *sim, size_t bytes) {
                            .n_sets = sim->n_sets,
                            .n_walls = sim->n_walls,
                            .n_probes = sim->def->n_probes,
+                           .n_stages = sim->def->n_stages,
                            .n_particles = sim->n_particles,
                            .dimension = sim->grid.dim,
                            .basis = (int32_t)sim->def->basis};
@@ -34,6 +35,9 @@ static void walk(struct mpm_sim *sim, visit *each, void *context) {
     for (size_t k = 0; k < sim->n_walls; k++) {
         each(context, &sim->walls[k].active, sizeof sim->walls[k].active);
         each(context, sim->walls[k].reaction, sizeof sim->walls[k].reaction);
+    }
+    for (size_t k = 0; k < sim->n_loads; k++) {
+        each(context, &sim->loads[k].active, sizeof sim->loads[k].active);
     }
     if (sim->averages) {
         each(context, sim->averages, sim->def->n_probes * sizeof *sim->averages);

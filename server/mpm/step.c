@@ -201,6 +201,15 @@ enum mpm_status mpm_step(struct mpm_sim *sim, struct mpm_error *err) {
         sim->kernels->p2g(&(struct mpm_span){
             .s = &sim->sets[b], .grid = &sim->grid, .begin = 0, .end = sim->sets[b].n, .dt = dt});
     }
+    for (size_t k = 0; k < sim->n_loads; k++) {
+        struct mpm_load *load = &sim->loads[k];
+        struct mpm_particles *s = &sim->sets[load->def.body];
+        if (load->active) {
+            mpm_load_update(load, s, sim->c.time - mpm_start_time(sim));
+            sim->kernels->force(&(struct mpm_span){.s = s, .grid = &sim->grid}, load->particle,
+                                load->force, load->n);
+        }
+    }
     charge(sim, MPM_PHASE_P2G, &clock);
 
     // Grid, eq. 9, and boundary conditions
@@ -210,7 +219,7 @@ enum mpm_status mpm_step(struct mpm_sim *sim, struct mpm_error *err) {
     } else {
         update_nodes(&sim->grid, gravity, now, dt, 3);
     }
-    mpm_walls_apply(sim->walls, sim->n_walls, &sim->grid, dt);
+    mpm_walls_apply(sim->walls, sim->n_walls, &sim->grid, gravity, dt);
     charge(sim, MPM_PHASE_GRID, &clock);
 
     // G2P, eqs. 11-17
@@ -262,6 +271,12 @@ enum mpm_status mpm_step(struct mpm_sim *sim, struct mpm_error *err) {
     for (size_t k = 0; k < sim->n_walls; k++) {
         for (int d = 0; sim->walls[k].active && d < dim; d++) {
             sim->c.external_work -= dt * sim->walls[k].reaction[d] * sim->walls[k].def.velocity[d];
+        }
+    }
+    for (size_t k = 0; k < sim->n_loads; k++) {
+        if (sim->loads[k].active) {
+            sim->c.external_work +=
+                mpm_load_work(&sim->loads[k], &sim->sets[sim->loads[k].def.body]);
         }
     }
     sim->c.v2_max = found.v2_max;

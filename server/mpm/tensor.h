@@ -30,6 +30,15 @@ MPM_KERNEL double mpm_det_minus_one(const double *D, const int dim) {
     return trace + (minors + mpm_det(D, 3));
 }
 
+// Determinant of a symmetric tensor in its storage; in 2D the out-of-plane component is a factor.
+MPM_KERNEL double mpm_det_sym(const double *s, const int dim) {
+    if (dim == 2) {
+        return (s[0] * s[1] - s[3] * s[3]) * s[2];
+    }
+    return s[0] * (s[1] * s[2] - s[4] * s[4]) - s[3] * (s[3] * s[2] - s[4] * s[5]) +
+           s[5] * (s[3] * s[4] - s[1] * s[5]);
+}
+
 // Row and column of stored component k of a symmetric tensor.
 MPM_KERNEL int mpm_sym_row(const int k) {
     return k < 3 ? k : k == 3 ? 0 : k == 4 ? 1 : 2;

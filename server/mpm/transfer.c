@@ -86,6 +86,24 @@ MPM_KERNEL void p2g(const struct mpm_span *span, const int dim, const enum mpm_b
     }
 }
 
+MPM_KERNEL void force(const struct mpm_span *span, const uint32_t *particle, const double *f,
+                      size_t n, const int dim, const enum mpm_basis basis) {
+    const struct mpm_grid *g = span->grid;
+    for (size_t k = 0; k < n; k++) {
+        struct stencil t;
+        stencil_at(&t, span, particle[k], dim, basis);
+        FOR_ROWS(dim, basis) {
+            double *row = g->node + ROW_NODE(t, g, dim) * MPM_NODE(dim);
+            for (int c = 0; c < mpm_support(basis); c++) {
+                const double w = ROW_WEIGHT(t, dim) * t.w[dim - 1][c];
+                for (int d = 0; d < dim; d++) {
+                    row[c * MPM_NODE(dim) + 1 + dim + d] += w * f[k * (size_t)dim + (size_t)d];
+                }
+            }
+        }
+    }
+}
+
 static struct mpm_span_result empty_result(void) {
     return (struct mpm_span_result){
         .min = {INFINITY, INFINITY, INFINITY},
@@ -122,6 +140,69 @@ MPM_KERNEL void finish(const struct mpm_span *span, size_t begin, size_t end,
                 fault(r, p, MPM_ERR_NOT_FINITE, *x);
             }
         }
+    }
+}
+
+// eq. 14 with dF = 1 + D, on what the material keeps.
+MPM_KERNEL void deform(struct mpm_particles *s, size_t p, const double *D, double dJ_minus_one,
+                       const int dim, const enum mpm_kinematics kinematics) {
+    if (kinematics == MPM_KEEPS_J) {
+        s->Jbar[p] += s->Jbar[p] * dJ_minus_one;
+        if (s->J_raw) {
+            s->J_raw[p] += s->J_raw[p] * dJ_minus_one;
+        }
+        return;
+    }
+    double A[9], DA[9]; // F, or b in full
+    for (int i = 0; i < dim; i++) {
+        for (int j = 0; j < dim; j++) {
+            A[i * dim + j] = kinematics == MPM_KEEPS_F
+                                 ? s->F[mpm_at(p, dim * dim, i * dim + j)]
+                                 : s->b[mpm_at(p, MPM_SYM(dim), mpm_sym_index(i, j))];
+        }
+    }
+    for (int i = 0; i < dim; i++) {
+        for (int j = 0; j < dim; j++) {
+            DA[i * dim + j] = 0;
+            for (int k = 0; k < dim; k++) {
+                DA[i * dim + j] += D[i * dim + k] * A[k * dim + j];
+            }
+        }
+    }
+    if (kinematics == MPM_KEEPS_F) {
+        for (int k = 0; k < dim * dim; k++) {
+            s->F[mpm_at(p, dim * dim, k)] = A[k] + DA[k];
+        }
+        return;
+    }
+    for (int i = 0; i < dim; i++) { // dF b dF^T = b + D b + (D b)^T + D b D^T
+        for (int j = i; j < dim; j++) {
+            double change = DA[i * dim + j] + DA[j * dim + i];
+            for (int k = 0; k < dim; k++) {
+                change += DA[i * dim + k] * D[j * dim + k];
+            }
+            s->b[mpm_at(p, MPM_SYM(dim), mpm_sym_index(i, j))] += change;
+        }
+    }
+}
+
+// mpm_ratio_in_use with its choices made.
+MPM_KERNEL double ratio_in_use(const struct mpm_particles *s, size_t p, const int dim,
+                               const enum mpm_kinematics kinematics) {
+    double A[9];
+    switch (kinematics) {
+    case MPM_KEEPS_J:
+        return s->Jbar[p];
+    case MPM_KEEPS_B:
+        for (int k = 0; k < MPM_SYM(dim); k++) {
+            A[k] = s->b[mpm_at(p, MPM_SYM(dim), k)];
+        }
+        return sqrt(mpm_det_sym(A, dim));
+    default:
+        for (int k = 0; k < dim * dim; k++) {
+            A[k] = s->F[mpm_at(p, dim * dim, k)];
+        }
+        return mpm_det(A, dim);
     }
 }
 
@@ -180,32 +261,8 @@ MPM_KERNEL void g2p(const struct mpm_span *span, struct mpm_span_result *result,
                 D[k] = span->dt * l[k];
             }
             const double dJ_minus_one = mpm_det_minus_one(D, dim);
-            double ratio;
-            if (kinematics == MPM_KEEPS_F) { // eq. 14
-                double F[9], F_new[9];
-                for (int k = 0; k < dim * dim; k++) {
-                    F[k] = s->F[mpm_at(p, dim * dim, k)];
-                }
-                for (int i = 0; i < dim; i++) {
-                    for (int j = 0; j < dim; j++) {
-                        double sum = 0;
-                        for (int k = 0; k < dim; k++) {
-                            sum += D[i * dim + k] * F[k * dim + j];
-                        }
-                        F_new[i * dim + j] = F[i * dim + j] + sum;
-                    }
-                }
-                for (int k = 0; k < dim * dim; k++) {
-                    s->F[mpm_at(p, dim * dim, k)] = F_new[k];
-                }
-                ratio = mpm_det(F_new, dim);
-            } else {
-                s->Jbar[p] += s->Jbar[p] * dJ_minus_one;
-                ratio = s->Jbar[p];
-                if (s->J_raw) {
-                    s->J_raw[p] += s->J_raw[p] * dJ_minus_one;
-                }
-            }
+            deform(s, p, D, dJ_minus_one, dim, kinematics);
+            const double ratio = ratio_in_use(s, p, dim, kinematics);
             if (fbar) {
                 s->dJ[p] = 1 + dJ_minus_one;
                 for (int d = 0; d < dim; d++) {
@@ -307,10 +364,13 @@ MPM_KERNEL void fbar_finish(const struct mpm_span *span, struct mpm_span_result 
         }
         if (s->Jbar) {
             s->Jbar[p] = ratio;
-        } else { // Algorithm 1, step 4, applied to the trial F instead of to dF
+        } else { // Algorithm 1, step 4, applied to the trial deformation instead of to dF
             const double q = ratio / trial, scale = dim == 2 ? sqrt(q) : cbrt(q);
-            for (int k = 0; k < dim * dim; k++) {
+            for (int k = 0; s->F && k < dim * dim; k++) {
                 s->F[mpm_at(p, dim * dim, k)] *= scale;
+            }
+            for (int k = 0; s->b && k < MPM_SYM(dim); k++) { // not b33 in plane strain
+                s->b[mpm_at(p, MPM_SYM(dim), k)] *= dim == 2 && k == 2 ? 1 : scale * scale;
             }
         }
     }
@@ -330,11 +390,21 @@ MPM_KERNEL void fbar_finish(const struct mpm_span *span, struct mpm_span_result 
         p2g(span, D, MPM_##B);                                                                     \
     }                                                                                              \
     static void g2p_##D##d_##B(const struct mpm_span *span, struct mpm_span_result *result) {      \
-        if (span->s->material->kinematics == MPM_KEEPS_F) {                                        \
+        switch (span->s->material->kinematics) {                                                   \
+        case MPM_KEEPS_F:                                                                          \
             g2p(span, result, D, MPM_##B, MPM_KEEPS_F);                                            \
-        } else {                                                                                   \
+            break;                                                                                 \
+        case MPM_KEEPS_J:                                                                          \
             g2p(span, result, D, MPM_##B, MPM_KEEPS_J);                                            \
+            break;                                                                                 \
+        case MPM_KEEPS_B:                                                                          \
+            g2p(span, result, D, MPM_##B, MPM_KEEPS_B);                                            \
+            break;                                                                                 \
         }                                                                                          \
+    }                                                                                              \
+    static void force_##D##d_##B(const struct mpm_span *span, const uint32_t *particle,            \
+                                 const double *f, size_t n) {                                      \
+        force(span, particle, f, n, D, MPM_##B);                                                   \
     }                                                                                              \
     static void scatter_zhao_##D##d_##B(const struct mpm_span *span) {                             \
         fbar_scatter(span, D, MPM_##B, MPM_FBAR_ZHAO);                                             \
@@ -355,6 +425,7 @@ KERNELS(DEFINE)
 #define ENTRY(D, B)                                                                                \
     [(D - 2) * MPM_N_BASES + MPM_##B] = {                                                          \
         .p2g = p2g_##D##d_##B,                                                                     \
+        .force = force_##D##d_##B,                                                                 \
         .g2p = g2p_##D##d_##B,                                                                     \
         .fbar_scatter = {NULL, scatter_zhao_##D##d_##B, scatter_anchored_##D##d_##B},              \
         .fbar_finish = {NULL, finish_zhao_##D##d_##B, finish_anchored_##D##d_##B},                 \

@@ -26,10 +26,13 @@ struct mpm_span_result {
 struct mpm_kernels {
     // eqs. 7, 8, 10: mass, momentum and internal force to the grid.
     void (*p2g)(const struct mpm_span *span);
+    // A force on each of n particles (indices, ascending) to the grid: f_i += w_ip f_p.
+    void (*force)(const struct mpm_span *span, const uint32_t *particle, const double *f, size_t n);
     // eqs. 11-17: velocity, and the deformation with the plain increment; then, where F-bar is off,
     // stress and position. With F-bar on it leaves dx and dJ for fbar_finish.
     void (*g2p)(const struct mpm_span *span, struct mpm_span_result *result);
-    // eq. 19, with the volume of time n: V and V Jbar dJ (or the sums of the anchored scheme) to the grid.
+    // eq. 19, with the volume of time n: V and V Jbar dJ (or the sums of the anchored scheme) to
+    // the grid.
     void (*fbar_scatter[MPM_N_FBAR_SCHEMES])(const struct mpm_span *span);
     // eqs. 20, 25: averaged ratio to the particles, deformation scaled to it; then stress and
     // position.
