@@ -182,22 +182,51 @@ static void condition(const struct mpm_wall *w, double *velocity, int dim) {
     }
 }
 
-// Nodes on and beyond the wall; the momentum that the condition takes is the force on the wall.
-static void apply_direct(struct mpm_wall *w, struct mpm_grid *g, double dt) {
+// Whether an earlier wall has set component d of a node, given its place in the grid, already.
+static bool set_before(const struct mpm_wall *walls, const struct mpm_wall *w, const int *place,
+                       int d, int dim) {
+    for (const struct mpm_wall *o = walls; o < w; o++) {
+        bool in =
+            o->active && !o->folds && parity(o, d) < 0 &&
+            (o->def.keeps_above ? place[o->def.axis] <= o->plane : place[o->def.axis] >= o->plane);
+        for (int e = 0; e < dim; e++) {
+            in &= e == o->def.axis || (place[e] >= o->lo[e] && place[e] < o->hi[e]);
+        }
+        if (in) {
+            return true;
+        }
+    }
+    return false;
+}
+
+// Nodes on and beyond the wall. What forces (without damping, which on a held node is no force on
+// anything) and momentum would have done but for the condition is the force on the wall.
+static void apply_direct(const struct mpm_wall *walls, struct mpm_wall *w, struct mpm_grid *g,
+                         const double *gravity, double dt) {
     const int dim = g->dim, axis = w->def.axis;
     const int first = w->def.keeps_above ? g->lo[axis] : (int)fmax(w->plane, g->lo[axis]);
     const int last = w->def.keeps_above ? (int)fmin(w->plane + 1, g->hi[axis]) : g->hi[axis];
     memset(w->reaction, 0, sizeof w->reaction);
     FOR_COLUMNS(w, g, column, k) {
+        int place[MPM_MAX_DIM] = {0};
+        for (int e = 0; e < dim; e++) {
+            place[e] = (int)(column / g->stride[e] % (size_t)g->n[e]);
+        }
         for (int i = first; i < last; i++) {
             const size_t node = column + (size_t)i * g->stride[axis];
             const double m = g->node[node * MPM_NODE(dim)];
             if (m > 0) {
+                const double *f = g->node + node * MPM_NODE(dim) + 1 + dim;
                 double *v = g->velocity + node * MPM_VELOCITY(dim), before[MPM_MAX_DIM];
                 memcpy(before, v, (size_t)dim * sizeof *v);
                 condition(w, v, dim);
+                place[axis] = i;
                 for (int d = 0; d < dim; d++) {
-                    w->reaction[d] += m * (before[d] - v[d]) / dt;
+                    if (v[d] != before[d]) {
+                        w->reaction[d] += set_before(walls, w, place, d, dim)
+                                              ? m * (before[d] - v[d]) / dt
+                                              : f[d] + m * gravity[d] - m * v[dim + d] / dt;
+                    }
                 }
             }
         }
@@ -205,7 +234,25 @@ static void apply_direct(struct mpm_wall *w, struct mpm_grid *g, double dt) {
     }
 }
 
-static void apply_folded(struct mpm_wall *w, struct mpm_grid *g) {
+static void hold_plane(const struct mpm_wall *w, struct mpm_grid *g) {
+    const int dim = g->dim;
+    FOR_COLUMNS(w, g, column, k) {
+        if (w->open && w->open[k]) {
+            continue;
+        }
+        double *plane =
+            g->velocity + (column + (size_t)w->plane * g->stride[w->def.axis]) * MPM_VELOCITY(dim);
+        for (int d = 0; d < dim; d++) {
+            if (parity(w, d) < 0) {
+                // FLIP sees the increment from the velocity before the condition, as everywhere.
+                plane[dim + d] += w->def.velocity[d] - plane[d];
+                plane[d] = w->def.velocity[d];
+            }
+        }
+    }
+}
+
+static void fill_ghosts(const struct mpm_wall *w, struct mpm_grid *g) {
     const int dim = g->dim, axis = w->def.axis;
     const size_t stride = g->stride[axis];
     FOR_COLUMNS(w, g, column, k) {
@@ -213,18 +260,12 @@ static void apply_folded(struct mpm_wall *w, struct mpm_grid *g) {
             continue;
         }
         double *ghost = g->velocity + (column + (size_t)w->ghost * stride) * MPM_VELOCITY(dim);
-        double *plane = g->velocity + (column + (size_t)w->plane * stride) * MPM_VELOCITY(dim);
         const double *inner =
             g->velocity + (column + (size_t)w->inner * stride) * MPM_VELOCITY(dim);
         for (int d = 0; d < dim; d++) {
-            const double s = parity(w, d), v_wall = w->def.velocity[d];
-            ghost[d] = s * inner[d] + (s < 0 ? 2 * v_wall : 0);
+            const double s = parity(w, d);
+            ghost[d] = s * inner[d] + (s < 0 ? 2 * w->def.velocity[d] : 0);
             ghost[dim + d] = s * inner[dim + d];
-            if (s < 0) {
-                // FLIP sees the increment from the velocity before the condition, as everywhere.
-                plane[dim + d] += v_wall - plane[d];
-                plane[d] = v_wall;
-            }
         }
         // What has come to lie beyond the image's reach is held as by a direct condition.
         const int step = w->ghost - w->plane;
@@ -234,41 +275,75 @@ static void apply_folded(struct mpm_wall *w, struct mpm_grid *g) {
     }
 }
 
+// Whether a folding wall sets component d of the node with the given place in the grid.
+static bool holds(const struct mpm_wall *w, const struct mpm_grid *g, const int *place, int d) {
+    if (!w->active || !w->folds || !reaches_window(w, g) || parity(w, d) > 0) {
+        return false;
+    }
+    bool in = abs(place[w->def.axis] - w->plane) <= 1;
+    for (int e = 0; e < g->dim; e++) {
+        in &= e == w->def.axis || (place[e] >= w->lo[e] && place[e] < w->hi[e]);
+    }
+    const int u = w->def.axis == 0 ? 1 : 0, v = g->dim == 2 ? 2 : w->def.axis == 2 ? 1 : 2;
+    return in && !(w->open && w->open[(size_t)place[u] * (size_t)g->n[v] + (size_t)place[v]]);
+}
+
 // Real momentum change of the three planes less what forces gave them: that came from the wall.
-static void folded_reaction(struct mpm_wall *w, const struct mpm_grid *g, double dt) {
-    const int dim = g->dim, planes[3] = {w->ghost, w->plane, w->inner};
-    const size_t stride = g->stride[w->def.axis];
+// Only the components that the wall holds, which elsewhere cancel over the planes; and where walls
+// meet, what an earlier one holds is the earlier one's.
+static void folded_reaction(const struct mpm_wall *walls, struct mpm_wall *w,
+                            const struct mpm_grid *g, double dt) {
+    const int dim = g->dim, axis = w->def.axis, planes[3] = {w->ghost, w->plane, w->inner};
+    const size_t stride = g->stride[axis];
     const double *real = w->real;
     memset(w->reaction, 0, sizeof w->reaction);
     FOR_COLUMNS(w, g, column, k) {
+        int place[MPM_MAX_DIM] = {0};
+        for (int e = 0; e < dim; e++) {
+            place[e] = (int)(column / g->stride[e] % (size_t)g->n[e]);
+        }
         for (int q = 0; q < 3; q++, real += 1 + dim) {
             const double *v =
                 g->velocity + (column + (size_t)planes[q] * stride) * MPM_VELOCITY(dim);
+            place[axis] = planes[q];
             for (int d = 0; d < dim; d++) {
-                w->reaction[d] -= real[0] * v[dim + d] / dt - real[1 + d];
+                bool mine = parity(w, d) < 0;
+                for (const struct mpm_wall *o = walls; mine && o < w; o++) {
+                    mine = !holds(o, g, place, d);
+                }
+                if (mine) {
+                    w->reaction[d] -= real[0] * v[dim + d] / dt - real[1 + d];
+                }
             }
         }
         (void)k;
     }
 }
 
-void mpm_walls_apply(struct mpm_wall *walls, size_t n_walls, struct mpm_grid *g, double dt) {
+void mpm_walls_apply(struct mpm_wall *walls, size_t n_walls, struct mpm_grid *g,
+                     const double *gravity, double dt) {
     for (size_t k = 0; k < n_walls; k++) {
         if (walls[k].active && !walls[k].folds) {
-            apply_direct(&walls[k], g, dt);
+            apply_direct(walls, &walls[k], g, gravity, dt);
         }
     }
-    // Backwards: the corner's ghost is the image of an image.
+    // All planes before any ghost: of two walls one cell apart, each one's plane is the other's
+    // inner plane. Backwards: the corner's ghost is the image of an image.
     for (size_t k = n_walls; k-- > 0;) {
         if (walls[k].active && walls[k].folds && reaches_window(&walls[k], g)) {
-            apply_folded(&walls[k], g);
+            hold_plane(&walls[k], g);
+        }
+    }
+    for (size_t k = n_walls; k-- > 0;) {
+        if (walls[k].active && walls[k].folds && reaches_window(&walls[k], g)) {
+            fill_ghosts(&walls[k], g);
         }
     }
     for (size_t k = 0; k < n_walls; k++) {
         struct mpm_wall *w = &walls[k];
         if (w->active && w->folds && w->wants_reaction) {
             if (reaches_window(w, g)) {
-                folded_reaction(w, g, dt);
+                folded_reaction(walls, w, g, dt);
             } else {
                 memset(w->reaction, 0, sizeof w->reaction);
             }

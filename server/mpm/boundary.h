@@ -30,7 +30,8 @@ void mpm_wall_free(struct mpm_wall *wall);
 void mpm_walls_fold(struct mpm_wall *walls, size_t n_walls, struct mpm_grid *grid,
                     const double *gravity, double dt);
 // After: the condition on v^{n+1} (and, where folded, the ghost nodes' values), and the reactions.
-void mpm_walls_apply(struct mpm_wall *walls, size_t n_walls, struct mpm_grid *grid, double dt);
+void mpm_walls_apply(struct mpm_wall *walls, size_t n_walls, struct mpm_grid *grid,
+                     const double *gravity, double dt);
 // Folds the sums that F-bar averages (even); and, once they are averages, gives the ghosts theirs.
 void mpm_walls_fold_fbar(const struct mpm_wall *walls, size_t n_walls, struct mpm_grid *grid);
 void mpm_walls_mirror_fbar(const struct mpm_wall *walls, size_t n_walls, struct mpm_grid *grid);

@@ -186,7 +186,6 @@ static void check_material(struct report *r, const struct mpm_material_def *m, c
 
 struct outside {
     const struct mpm_def *def;
-    const struct mpm_body_def *body;
     const struct mpm_shape *other;
     size_t out_of_domain, beyond_wall, in_other, bad_volume;
     int wall;
@@ -208,6 +207,20 @@ static int wall_in_front(const struct mpm_def *def, const double *x) {
         }
     }
     return -1;
+}
+
+// Whether the whole bounding box of a shape lies in the domain and behind no wall.
+static bool surely_inside(const struct mpm_def *def, const struct mpm_shape *shape) {
+    double min[MPM_MAX_DIM], max[MPM_MAX_DIM];
+    bool inside = mpm_shape_bounds(shape, def->dimension, min, max);
+    for (int d = 0; inside && d < def->dimension; d++) {
+        inside = min[d] >= def->domain_min[d] && max[d] <= def->domain_max[d];
+    }
+    for (size_t k = 0; inside && k < def->n_walls; k++) {
+        const struct mpm_wall_def *w = &def->walls[k];
+        inside = w->keeps_above ? min[w->axis] >= w->at : max[w->axis] <= w->at;
+    }
+    return inside;
 }
 
 static bool look_at(void *context, const double *x, double volume) {
@@ -276,9 +289,10 @@ static void check_body(struct report *r, const struct mpm_def *def, size_t b, do
         *total = INFINITY; // nothing of this size is counted one by one
         return;
     }
-    struct outside o = {
-        .def = def, .body = body, .unit = def->cell / 2 / body->particles_per_direction};
-    const size_t n = mpm_seed(def, body, look_at, &o);
+    struct outside o = {.def = def, .unit = def->cell / 2 / body->particles_per_direction};
+    // One by one only where something can be wrong with a particle.
+    const bool clear = body->shape.kind != MPM_SHAPE_POINTS && surely_inside(def, &body->shape);
+    const size_t n = mpm_seed(def, body, clear ? NULL : look_at, &o);
     const char *place = body->shape.kind == MPM_SHAPE_POINTS ? "/shape/points" : "/shape";
     if (n == 0) {
         FAULT(
@@ -370,6 +384,14 @@ static void check_stages(struct report *r, const struct mpm_def *def) {
                   "above 0, s", TEXT("%.9g", s->duration), "stage '%s' must last some time",
                   s->name);
         }
+        // On top of the defaults, so that a fault is the stage's own; dt is looked at in check_times.
+        const struct mpm_settings defaults = mpm_settings_default(),
+                                  now = mpm_stage_settings(def, k, &defaults);
+        struct mpm_error fault;
+        if (mpm_check_settings(&now, TEXT("/stages/%zu", k), def->dimension, INFINITY, true,
+                               &fault)) {
+            add(r, &fault);
+        }
         for (size_t m = 0; s->materials && m < def->n_materials; m++) {
             check_material(r, &s->materials[m], TEXT("/stages/%zu", k));
         }
@@ -381,12 +403,10 @@ static void check_times(struct report *r, const struct mpm_def *def) {
     struct mpm_error fault;
     for (size_t k = 0; k < def->n_stages; k++) {
         const struct mpm_stage_def *s = &def->stages[k];
-        struct mpm_settings now = def->settings;
-        const char *pointer = "";
+        const struct mpm_settings now = mpm_stage_settings(def, k, &def->settings);
+        char pointer[32] = "";
         if (s->states & MPM_SET_TIME) {
-            now.dt = s->settings.dt;
-            now.cfl = s->settings.cfl;
-            pointer = TEXT("/stages/%zu", k);
+            snprintf(pointer, sizeof pointer, "/stages/%zu", k);
         } else if (k > 0 && !s->materials) {
             continue; // said already
         }

@@ -1,5 +1,4 @@
 // Probes, and the balance of conserved quantities. Sums run in the order of the particles.
-#include <stdlib.h>
 #include <string.h>
 
 #include "server/mpm/sim.h"
@@ -109,9 +108,36 @@ static void fold_field(const struct mpm_sim *sim, const struct mpm_probe_def *q,
     }
 }
 
-static int ascending(const void *a, const void *b) {
-    const double x = *(const double *)a, y = *(const double *)b;
-    return (x > y) - (x < y);
+// The value of the given rank (0 = smallest) among n, which it reorders: Hoare's selection. qsort
+// may allocate.
+static double ranked(double *value, size_t n, size_t rank) {
+    ptrdiff_t lo = 0, hi = (ptrdiff_t)n - 1;
+    const ptrdiff_t k = (ptrdiff_t)rank;
+    while (lo < hi) {
+        const double pivot = value[lo + (hi - lo) / 2];
+        ptrdiff_t i = lo, j = hi;
+        while (i <= j) {
+            while (value[i] < pivot) {
+                i++;
+            }
+            while (value[j] > pivot) {
+                j--;
+            }
+            if (i <= j) {
+                const double swap = value[i];
+                value[i++] = value[j];
+                value[j--] = swap;
+            }
+        }
+        if (k <= j) {
+            hi = j;
+        } else if (k >= i) {
+            lo = i;
+        } else {
+            break;
+        }
+    }
+    return value[k];
 }
 
 // How far a body reaches along an axis: its outermost particle, or the one at a quantile of them.
@@ -129,9 +155,8 @@ static double extent(struct mpm_sim *sim, const struct mpm_probe_def *q) {
         }
     }
     if (q->quantile < 1 && n > 0) {
-        qsort(sim->scratch, n, sizeof *sim->scratch, ascending);
         const size_t rank = (size_t)ceil(q->quantile * (double)n) - 1;
-        far = sim->scratch[q->max_side ? rank : n - 1 - rank];
+        far = ranked(sim->scratch, n, q->max_side ? rank : n - 1 - rank);
     }
     return far;
 }

@@ -65,7 +65,7 @@ double mpm_next_dt(const struct mpm_sim *sim) {
     const double dt = c->now.dt > 0 ? c->now.dt : c->now.cfl / STABLE_CFL * mpm_dt_limit(sim);
     const double left = c->stage_end - c->time;
     // Fit the last step to the end, but leave a whole step whole whatever round-off says.
-    return left < dt * (1 - 1e-6) ? left : dt;
+    return left > 0 && left < dt * (1 - 1e-6) ? left : dt;
 }
 
 void mpm_gravity_at(const struct mpm_sim *sim, double t, double *g) {
@@ -97,9 +97,8 @@ static void overlay(struct mpm_settings *on, const struct mpm_settings *from, un
     }
 }
 
-// The base settings with what the stage states.
-static struct mpm_settings stage_settings(const struct mpm_def *def, size_t stage,
-                                          const struct mpm_settings *base) {
+struct mpm_settings mpm_stage_settings(const struct mpm_def *def, size_t stage,
+                                       const struct mpm_settings *base) {
     struct mpm_settings now = *base;
     overlay(&now, &def->stages[stage].settings, def->stages[stage].states);
     return now;
@@ -180,12 +179,16 @@ void mpm_enter_stage(struct mpm_sim *sim, size_t stage) {
     if (stage > 0) {
         mpm_gravity_at(sim, c->time, c->gravity_before);
     }
+    const double begin = -time_before_last(def, stage);
+    if (sim->averages && begin != c->time) { // no mean reaches over a jump of the clock
+        memset(sim->averages, 0, def->n_probes * sizeof *sim->averages);
+    }
     c->stage = stage;
-    c->stage_begin = c->time = c->anchor_time = -time_before_last(def, stage);
+    c->stage_begin = c->time = c->anchor_time = begin;
     c->stage_end = stage + 1 == def->n_stages ? c->end : -time_before_last(def, stage + 1);
     c->steps_since_anchor = 0;
     c->kinetic_max = 0;
-    c->now = stage_settings(def, stage, &c->base);
+    c->now = mpm_stage_settings(def, stage, &c->base);
     for (size_t k = 0; s->removes_wall && k < sim->n_walls; k++) {
         sim->walls[k].active &= !s->removes_wall[k];
         if (s->removes_wall[k]) {
@@ -464,7 +467,7 @@ void mpm_estimate(const struct mpm_def *def, struct mpm_estimate *out) {
     free(n);
     double steps = 0;
     for (size_t k = 0; k < def->n_stages; k++) {
-        const struct mpm_settings now = stage_settings(def, k, &def->settings);
+        const struct mpm_settings now = mpm_stage_settings(def, k, &def->settings);
         out->dt_limit = mpm_def_dt_limit(def, k);
         out->dt = now.dt > 0 ? now.dt : now.cfl / STABLE_CFL * out->dt_limit;
         steps += ceil(def->stages[k].duration / out->dt * (1 - 1e-9));

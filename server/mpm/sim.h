@@ -52,6 +52,9 @@ struct mpm_sim {
 // The material of a body with the patches of the stages up to and including `stage`.
 const struct mpm_material_def *mpm_material_of(const struct mpm_def *def, int material,
                                                size_t stage);
+// The base settings with what the stage states.
+struct mpm_settings mpm_stage_settings(const struct mpm_def *def, size_t stage,
+                                       const struct mpm_settings *base);
 // Gravity in force at time t of the present stage, m/s^2.
 void mpm_gravity_at(const struct mpm_sim *sim, double t, double *g);
 // Fastest P-wave of the present materials, m/s; and the limit on dt that it sets with particles

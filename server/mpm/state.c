@@ -8,7 +8,7 @@
 #define STATE_MAGIC 0x31746174534d504dULL // "MPMStat1"
 
 struct header {
-    uint64_t magic, bytes, n_sets, n_walls, n_probes, n_particles;
+    uint64_t magic, bytes, n_sets, n_walls, n_probes, n_stages, n_particles;
     int32_t dimension, basis;
 };
 
@@ -18,6 +18,7 @@ static struct header header_of(const struct mpm_sim *sim, size_t bytes) {
                            .n_sets = sim->n_sets,
                            .n_walls = sim->n_walls,
                            .n_probes = sim->def->n_probes,
+                           .n_stages = sim->def->n_stages,
                            .n_particles = sim->n_particles,
                            .dimension = sim->grid.dim,
                            .basis = (int32_t)sim->def->basis};

@@ -210,7 +210,7 @@ enum mpm_status mpm_step(struct mpm_sim *sim, struct mpm_error *err) {
     } else {
         update_nodes(&sim->grid, gravity, now, dt, 3);
     }
-    mpm_walls_apply(sim->walls, sim->n_walls, &sim->grid, dt);
+    mpm_walls_apply(sim->walls, sim->n_walls, &sim->grid, gravity, dt);
     charge(sim, MPM_PHASE_GRID, &clock);
 
     // G2P, eqs. 11-17
