@@ -1,0 +1,63 @@
+// HTTP as the routes see it: a request with its body in memory, a reply to fill. The only file that
+// knows libmicrohttpd is http.c.
+#pragma once
+#include <stdbool.h>
+#include <stddef.h>
+#include <stdint.h>
+
+#define HTTP_HEADERS_MAX 8
+
+struct http_request;
+const char *http_method(const struct http_request *request);
+const char *http_path(const struct http_request *request); // as sent, without query, not decoded
+const char *http_header(const struct http_request *request, const char *name); // or NULL
+// A query parameter, decoded into `out`; false when it is not there. One that does not fit, or
+// whose escapes are wrong, reads as empty.
+bool http_query(const struct http_request *request, const char *key, char *out, size_t bytes);
+const char *http_body(const struct http_request *request, size_t *bytes); // terminated
+// Decodes %XX in place; false on a bad escape or a zero byte.
+bool http_decode(char *text);
+
+struct http_reply {
+    int status;
+    const char *type; // of the body, static; NULL = no body
+    char *body;       // from malloc; the server's
+    size_t bytes;
+    int fd; // >= 0: the body is `bytes` bytes of it from `offset`; the server closes it
+    uint64_t offset;
+    // Not NULL: a body without end. Returns how many bytes it wrote, 0 at the end; may block for
+    // about a second. `close` ends it.
+    size_t (*produce)(void *stream, char *out, size_t bytes);
+    void (*close)(void *stream);
+    void *stream;
+    unsigned n_headers;
+    struct {
+        const char *name; // static
+        char value[256];
+    } headers[HTTP_HEADERS_MAX];
+};
+void http_reply_header(struct http_reply *reply, const char *name, const char *format, ...)
+    __attribute__((format(printf, 3, 4)));
+
+struct http_service {
+    void *context;
+    size_t max_body;
+    // Called when the headers are in. False with the reply filled to refuse.
+    bool (*admit)(void *context, struct http_request *request, struct http_reply *reply);
+    // Called when the body is in, from any thread, several at a time.
+    void (*serve)(void *context, struct http_request *request, struct http_reply *reply);
+    // Fills the reply to a body over the limit.
+    void (*too_large)(void *context, struct http_reply *reply);
+};
+struct http_address {
+    const char *host, *port;        // port "0" picks one
+    const char *tls_cert, *tls_key; // files, or NULL
+};
+
+struct http_server;
+// `url` receives "http://127.0.0.1:40123". NULL with a sentence in `why`.
+struct http_server *http_start(const struct http_address *address,
+                               const struct http_service *service, char *url, size_t url_bytes,
+                               char *why, size_t why_bytes);
+void http_quiesce(struct http_server *server); // accepts no more connections
+void http_stop(struct http_server *server);    // after the replies under way

@@ -1,0 +1,450 @@
+// One thread, one PUB socket, one queue a run. Order of a frame: digest, journal, socket; so
+// nothing is ever seen on the wire that a crash could take back.
+//
+// ZeroMQ sends without a copy: a message holds a reference on the frame, and the last one (journal
+// done, every subscriber's pipe done or dropped) frees it. SEND_HIGH_WATER bounds what a stalled
+// subscriber can hold.
+#include "server/publish.h"
+
+#include <errno.h>
+#include <pthread.h>
+#include <stdatomic.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <time.h>
+#include <zmq.h>
+
+#include "proto/frame.h"
+#include "server/log.h"
+
+#define SEND_HIGH_WATER 8 // messages a subscriber may lag before it loses some
+#define LINGER_MS 1000
+#define RETRY_SECONDS 0.5 // between two tries on a full disk
+#define EVENTS_MAX 256    // queued events of a run; the log has them all
+
+struct item {
+    struct item *next;
+    struct buffer *frame; // or else
+    char *event;
+};
+struct buffer {
+    struct outlet_frame public; // first: the handle that the run fills
+    atomic_uint references;
+};
+
+struct outlet {
+    struct outlet *next;
+    struct publisher *publisher;
+    struct journal *journal;
+    void (*wake)(void *context);
+    void *context;
+    char frame_topic[80], event_topic[80];
+    // Under the publisher's lock:
+    struct item *first, *last;
+    unsigned n_frames, n_events;
+    bool busy; // the thread is at work on one of its items
+    enum journal_result status;
+    struct timespec retry;
+    char why[JOURNAL_WHY];
+};
+
+struct publisher {
+    void *context, *socket;
+    pthread_t thread;
+    pthread_mutex_t lock;
+    pthread_cond_t work, done; // both on CLOCK_MONOTONIC
+    struct outlet *outlets;
+    struct outlet *turn; // whose item was taken last
+    bool stop;
+    struct publish_counts counts;
+};
+
+// ---- Buffers ----------------------------------------------------------------------------------
+
+struct outlet_frame *publish_buffer(size_t bytes) {
+    struct buffer *buffer = calloc(1, sizeof *buffer);
+    if (buffer == NULL)
+        return NULL;
+    size_t rounded = (bytes + FRAME_ALIGN - 1) / FRAME_ALIGN * FRAME_ALIGN;
+    buffer->public.frame = aligned_alloc(FRAME_ALIGN, rounded);
+    if (buffer->public.frame == NULL) {
+        free(buffer);
+        return NULL;
+    }
+    buffer->public.info.bytes = bytes;
+    atomic_init(&buffer->references, 1);
+    return &buffer->public;
+}
+
+static void buffer_release(struct buffer *buffer) {
+    if (atomic_fetch_sub(&buffer->references, 1) == 1) {
+        free(buffer->public.frame);
+        free(buffer);
+    }
+}
+
+void publish_drop(struct outlet_frame *frame) {
+    if (frame != NULL)
+        buffer_release((struct buffer *)frame);
+}
+
+static void message_free(void *bytes, void *hint) {
+    (void)bytes;
+    buffer_release(hint);
+}
+
+// ---- The thread -------------------------------------------------------------------------------
+
+static struct timespec after(double seconds) {
+    struct timespec t;
+    clock_gettime(CLOCK_MONOTONIC, &t);
+    t.tv_sec += (time_t)seconds;
+    t.tv_nsec += (long)((seconds - (double)(time_t)seconds) * 1e9);
+    if (t.tv_nsec >= 1000000000) {
+        t.tv_nsec -= 1000000000;
+        t.tv_sec++;
+    }
+    return t;
+}
+
+static bool is_past(const struct timespec *t) {
+    struct timespec now;
+    clock_gettime(CLOCK_MONOTONIC, &now);
+    return now.tv_sec > t->tv_sec || (now.tv_sec == t->tv_sec && now.tv_nsec >= t->tv_nsec);
+}
+
+// PUB never blocks; a message that a subscriber's pipe has no room for is dropped for that one.
+static void send_frame(struct publisher *p, const struct outlet *outlet, struct buffer *buffer) {
+    zmq_msg_t message;
+    atomic_fetch_add(&buffer->references, 1);
+    if (zmq_msg_init_data(&message, buffer->public.frame, buffer->public.info.bytes, message_free,
+                          buffer) != 0) {
+        buffer_release(buffer);
+        return;
+    }
+    if (zmq_send(p->socket, outlet->frame_topic, strlen(outlet->frame_topic),
+                 ZMQ_SNDMORE | ZMQ_DONTWAIT) < 0 ||
+        zmq_msg_send(&message, p->socket, ZMQ_DONTWAIT) < 0)
+        zmq_msg_close(&message);
+}
+
+static void send_event(struct publisher *p, const struct outlet *outlet, const char *json) {
+    if (zmq_send(p->socket, outlet->event_topic, strlen(outlet->event_topic),
+                 ZMQ_SNDMORE | ZMQ_DONTWAIT) >= 0)
+        zmq_send(p->socket, json, strlen(json), ZMQ_DONTWAIT);
+}
+
+static void announce_gone(struct publisher *p, struct outlet *outlet, uint64_t before) {
+    uint64_t gone = journal_n_gone(outlet->journal);
+    char json[96];
+    if (gone == before)
+        return;
+    snprintf(json, sizeof json, "{\"event\":\"dropped\",\"from\":%llu,\"to\":%llu}",
+             (unsigned long long)before, (unsigned long long)gone - 1);
+    send_event(p, outlet, json);
+    log_warn("frames_dropped", "topic=%s from=%llu to=%llu", outlet->frame_topic,
+             (unsigned long long)before, (unsigned long long)gone - 1);
+}
+
+// The next item that may be worked on, of the outlets in turn.
+static struct outlet *next_outlet(struct publisher *p) {
+    struct outlet *start = p->turn != NULL && p->turn->next != NULL ? p->turn->next : p->outlets;
+    struct outlet *o = start;
+    if (o == NULL)
+        return NULL;
+    do {
+        bool failed = o->status == JOURNAL_ERROR;
+        bool waits = o->status == JOURNAL_FULL && !is_past(&o->retry);
+        if (o->first != NULL && !waits && !failed)
+            return o;
+        o = o->next != NULL ? o->next : p->outlets;
+    } while (o != start);
+    return NULL;
+}
+
+// Called with the lock, which it gives up while it works.
+static void work_on(struct publisher *p, struct outlet *o) {
+    struct item *item = o->first;
+    enum journal_result result = JOURNAL_OK;
+    char why[JOURNAL_WHY] = "";
+    o->busy = true;
+    p->turn = o;
+    pthread_mutex_unlock(&p->lock);
+    if (item->frame != NULL) {
+        struct outlet_frame *frame = &item->frame->public;
+        uint64_t gone = journal_n_gone(o->journal);
+        frame->info.digest = frame_seal(frame->frame);
+        result = journal_append_frame(o->journal, frame->frame, &frame->info, why);
+        if (result == JOURNAL_OK) {
+            announce_gone(p, o, gone);
+            send_frame(p, o, item->frame);
+        } else {
+            log_error("journal", "topic=%s seq=%llu full=%d why=\"%s\"", o->frame_topic,
+                      (unsigned long long)frame->info.seq, result == JOURNAL_FULL, why);
+        }
+    } else {
+        send_event(p, o, item->event);
+    }
+    pthread_mutex_lock(&p->lock);
+    o->busy = false;
+    o->status = result;
+    memcpy(o->why, why, sizeof why);
+    if (result == JOURNAL_OK) {
+        o->first = item->next;
+        if (o->first == NULL)
+            o->last = NULL;
+        if (item->frame != NULL) {
+            o->n_frames--;
+            p->counts.frames++;
+            p->counts.bytes += item->frame->public.info.bytes;
+            buffer_release(item->frame);
+        } else {
+            o->n_events--;
+            p->counts.events++;
+            free(item->event);
+        }
+        free(item);
+    } else {
+        o->retry = after(RETRY_SECONDS);
+    }
+    pthread_cond_broadcast(&p->done);
+    void (*wake)(void *context) = o->wake;
+    void *context = o->context;
+    // The outlet cannot be freed in between: publish_close waits for `busy`.
+    o->busy = true;
+    pthread_mutex_unlock(&p->lock);
+    wake(context);
+    pthread_mutex_lock(&p->lock);
+    o->busy = false;
+    pthread_cond_broadcast(&p->done);
+}
+
+static void *publisher_thread(void *argument) {
+    struct publisher *p = argument;
+    pthread_mutex_lock(&p->lock);
+    for (;;) {
+        struct outlet *o = next_outlet(p);
+        if (o != NULL) {
+            work_on(p, o);
+            continue;
+        }
+        if (p->stop)
+            break;
+        struct timespec until = after(RETRY_SECONDS);
+        pthread_cond_timedwait(&p->work, &p->lock, &until);
+    }
+    pthread_mutex_unlock(&p->lock);
+    zmq_close(p->socket); // by the thread that used it
+    return NULL;
+}
+
+// ---- Start and stop ---------------------------------------------------------------------------
+
+static void condition_init(pthread_cond_t *condition) {
+    pthread_condattr_t attributes;
+    pthread_condattr_init(&attributes);
+    pthread_condattr_setclock(&attributes, CLOCK_MONOTONIC);
+    pthread_cond_init(condition, &attributes);
+    pthread_condattr_destroy(&attributes);
+}
+
+struct publisher *publish_start(const char *address, char *endpoint, size_t endpoint_bytes,
+                                char *why) {
+    struct publisher *p = calloc(1, sizeof *p);
+    if (p == NULL) {
+        snprintf(why, JOURNAL_WHY, "out of memory");
+        return NULL;
+    }
+    pthread_mutex_init(&p->lock, NULL);
+    condition_init(&p->work);
+    condition_init(&p->done);
+    int linger = LINGER_MS, high_water = SEND_HIGH_WATER, v6 = strchr(address, '[') != NULL;
+    p->context = zmq_ctx_new();
+    p->socket = p->context != NULL ? zmq_socket(p->context, ZMQ_PUB) : NULL;
+    if (p->socket == NULL || zmq_setsockopt(p->socket, ZMQ_LINGER, &linger, sizeof linger) != 0 ||
+        zmq_setsockopt(p->socket, ZMQ_SNDHWM, &high_water, sizeof high_water) != 0 ||
+        zmq_setsockopt(p->socket, ZMQ_IPV6, &v6, sizeof v6) != 0 ||
+        zmq_bind(p->socket, address) != 0 ||
+        zmq_getsockopt(p->socket, ZMQ_LAST_ENDPOINT, endpoint, &endpoint_bytes) != 0) {
+        snprintf(why, JOURNAL_WHY, "cannot publish on %s: %s", address, zmq_strerror(errno));
+        goto fail;
+    }
+    int error = pthread_create(&p->thread, NULL, publisher_thread, p);
+    if (error != 0) {
+        snprintf(why, JOURNAL_WHY, "cannot start the output thread: %s", strerror(error));
+        goto fail;
+    }
+    return p;
+fail:
+    if (p->socket != NULL)
+        zmq_close(p->socket);
+    if (p->context != NULL)
+        zmq_ctx_term(p->context);
+    free(p);
+    return NULL;
+}
+
+void publish_stop(struct publisher *p) {
+    if (p == NULL)
+        return;
+    pthread_mutex_lock(&p->lock);
+    p->stop = true;
+    pthread_cond_broadcast(&p->work);
+    pthread_mutex_unlock(&p->lock);
+    pthread_join(p->thread, NULL);
+    zmq_ctx_term(p->context); // waits LINGER_MS at most for subscribers
+    pthread_cond_destroy(&p->work);
+    pthread_cond_destroy(&p->done);
+    pthread_mutex_destroy(&p->lock);
+    free(p);
+}
+
+struct publish_counts publish_counts_now(struct publisher *p) {
+    pthread_mutex_lock(&p->lock);
+    struct publish_counts counts = p->counts;
+    pthread_mutex_unlock(&p->lock);
+    return counts;
+}
+
+// ---- Outlets ----------------------------------------------------------------------------------
+
+struct outlet *publish_open(struct publisher *publisher, const char *run, struct journal *journal,
+                            void (*wake)(void *context), void *context) {
+    struct outlet *o = calloc(1, sizeof *o);
+    if (o == NULL)
+        return NULL;
+    o->publisher = publisher;
+    o->journal = journal;
+    o->wake = wake;
+    o->context = context;
+    snprintf(o->frame_topic, sizeof o->frame_topic, "run/%.64s/frame", run);
+    snprintf(o->event_topic, sizeof o->event_topic, "run/%.64s/event", run);
+    pthread_mutex_lock(&publisher->lock);
+    o->next = publisher->outlets;
+    publisher->outlets = o;
+    pthread_mutex_unlock(&publisher->lock);
+    return o;
+}
+
+static void item_free(struct item *item) {
+    if (item->frame != NULL)
+        buffer_release(item->frame);
+    free(item->event);
+    free(item);
+}
+
+// Takes the queue of an outlet that the thread is not at work on. Called with the lock.
+static struct item *take_queue(struct outlet *o) {
+    while (o->busy)
+        pthread_cond_wait(&o->publisher->done, &o->publisher->lock);
+    struct item *first = o->first;
+    o->first = o->last = NULL;
+    o->n_frames = o->n_events = 0;
+    return first;
+}
+
+static void queue_free(struct item *first) {
+    while (first != NULL) {
+        struct item *next = first->next;
+        item_free(first);
+        first = next;
+    }
+}
+
+void publish_abandon(struct outlet *o) {
+    pthread_mutex_lock(&o->publisher->lock);
+    struct item *first = take_queue(o);
+    pthread_mutex_unlock(&o->publisher->lock);
+    queue_free(first);
+}
+
+void publish_close(struct outlet *o) {
+    if (o == NULL)
+        return;
+    struct publisher *p = o->publisher;
+    pthread_mutex_lock(&p->lock);
+    struct item *first = take_queue(o);
+    for (struct outlet **link = &p->outlets; *link != NULL; link = &(*link)->next)
+        if (*link == o) {
+            *link = o->next;
+            break;
+        }
+    if (p->turn == o)
+        p->turn = NULL;
+    pthread_mutex_unlock(&p->lock);
+    queue_free(first);
+    free(o);
+}
+
+bool publish_has_room(struct outlet *o) {
+    pthread_mutex_lock(&o->publisher->lock);
+    bool room = o->n_frames < OUTLET_DEPTH;
+    pthread_mutex_unlock(&o->publisher->lock);
+    return room;
+}
+
+static void append(struct outlet *o, struct item *item) {
+    if (o->last != NULL)
+        o->last->next = item;
+    else
+        o->first = item;
+    o->last = item;
+    pthread_cond_signal(&o->publisher->work);
+}
+
+void publish_push(struct outlet *o, struct outlet_frame *frame) {
+    struct item *item = calloc(1, sizeof *item);
+    pthread_mutex_lock(&o->publisher->lock);
+    if (item == NULL) {
+        o->status = JOURNAL_ERROR;
+        snprintf(o->why, sizeof o->why, "out of memory");
+    } else {
+        item->frame = (struct buffer *)frame;
+        o->n_frames++;
+        append(o, item);
+    }
+    pthread_mutex_unlock(&o->publisher->lock);
+    if (item == NULL)
+        publish_drop(frame);
+}
+
+void publish_event(struct outlet *o, const char *json) {
+    struct item *item = calloc(1, sizeof *item);
+    char *copy = strdup(json);
+    pthread_mutex_lock(&o->publisher->lock);
+    bool takes = item != NULL && copy != NULL && o->n_events < EVENTS_MAX;
+    if (takes) {
+        item->event = copy;
+        o->n_events++;
+        append(o, item);
+    }
+    pthread_mutex_unlock(&o->publisher->lock);
+    if (!takes) {
+        free(item);
+        free(copy);
+    }
+}
+
+enum journal_result publish_status(struct outlet *o, char *why) {
+    pthread_mutex_lock(&o->publisher->lock);
+    enum journal_result status = o->status;
+    memcpy(why, o->why, sizeof o->why);
+    pthread_mutex_unlock(&o->publisher->lock);
+    return status;
+}
+
+bool publish_flush(struct outlet *o, double seconds) {
+    struct publisher *p = o->publisher;
+    struct timespec until = after(seconds < 0 ? 0 : seconds);
+    pthread_mutex_lock(&p->lock);
+    while (o->first != NULL && o->status != JOURNAL_ERROR) {
+        if (seconds < 0)
+            pthread_cond_wait(&p->done, &p->lock);
+        else if (pthread_cond_timedwait(&p->done, &p->lock, &until) == ETIMEDOUT)
+            break;
+    }
+    bool flushed = o->first == NULL && o->status != JOURNAL_ERROR;
+    pthread_mutex_unlock(&p->lock);
+    return flushed;
+}

@@ -1,0 +1,61 @@
+// The output thread: takes filled frames and events, seals them, writes them to the run's journal
+// and then publishes them on the one ZeroMQ PUB socket, which only it touches.
+//
+// Each run has an outlet: a short queue, so that a run waits for the disk only when it is
+// OUTLET_DEPTH frames ahead of it, and never for a subscriber.
+#pragma once
+#include <stdbool.h>
+#include <stddef.h>
+#include <stdint.h>
+
+#include "server/journal.h"
+
+#define OUTLET_DEPTH 4 // frames of one run on their way to the disk
+
+struct publisher;
+struct outlet;
+
+// A frame being filled: header and arrays at `frame`, by the layout that frame_layout made.
+struct outlet_frame {
+    struct journal_frame info;
+    unsigned char *frame; // info.bytes bytes, 64-byte aligned
+};
+
+// Binds the socket and starts the thread. `endpoint` receives the address with the port that was
+// picked. NULL with a sentence in `why` (JOURNAL_WHY bytes).
+struct publisher *publish_start(const char *address, char *endpoint, size_t endpoint_bytes,
+                                char *why);
+// Writes and publishes what is queued, waits about a second for subscribers to take it, and ends.
+void publish_stop(struct publisher *publisher);
+
+// `wake` is called (from the output thread, without locks) when there is room again or something
+// failed. `journal` must outlive the outlet.
+struct outlet *publish_open(struct publisher *publisher, const char *run, struct journal *journal,
+                            void (*wake)(void *context), void *context);
+void publish_close(struct outlet *outlet); // what is still queued is dropped
+
+// Drops what could not be written, of a run that is over.
+void publish_abandon(struct outlet *outlet);
+
+bool publish_has_room(struct outlet *outlet);
+// A buffer for a frame of `bytes`, or NULL without memory. Give it back by publish_push or
+// publish_drop.
+struct outlet_frame *publish_buffer(size_t bytes);
+void publish_drop(struct outlet_frame *frame);
+// Takes the frame: from now on it is the outlet's.
+void publish_push(struct outlet *outlet, struct outlet_frame *frame);
+// Publishes an event that the journal has already, after the frames pushed before it. Copies
+// `json`.
+void publish_event(struct outlet *outlet, const char *json);
+
+// How the writing stands: JOURNAL_FULL while a frame waits for room on the disk (it is tried
+// again), JOURNAL_ERROR once it has failed for good; then `why` says why.
+enum journal_result publish_status(struct outlet *outlet, char *why);
+// Waits until all that was pushed is in the journal and handed to the socket; false when it is not
+// within `seconds` (< 0: as long as it takes) or the writing failed.
+bool publish_flush(struct outlet *outlet, double seconds);
+
+struct publish_counts {
+    uint64_t frames, bytes, events; // handed to the socket since the start
+};
+struct publish_counts publish_counts_now(struct publisher *publisher);

@@ -1,0 +1,260 @@
+// The table of routes, and the way from a request to one of them.
+#include <stdio.h>
+#include <string.h>
+#include <strings.h>
+
+#include "server/log.h"
+#include "server/routes_inside.h"
+
+#define SEGMENTS_MAX 8
+
+// ---- The table --------------------------------------------------------------------------------
+
+#define JSON "application/json"
+#define FRAME "application/vnd.fbard.frame"
+#define ACTION(verb, code, text)                                                                   \
+    {                                                                                              \
+        "POST", "/v1/runs/{id}:" verb, routes_serve_action, RUN_DO_##code, text, "Empty", false,   \
+            false, 200, "Run", JSON, NULL, "409 503 507"                                           \
+    }
+
+const struct route routes_table[] = {
+    {"GET", "/healthz", routes_serve_health, -1, "Alive", NULL, false, false, 200, "Health", JSON,
+     NULL, NULL},
+    {"GET", "/readyz", routes_serve_ready, -1, "Able to take a run", NULL, false, false, 200,
+     "Health", JSON, NULL, "503"},
+    {"GET", "/openapi.json", routes_serve_openapi, -1, "This document", NULL, false, false, 200,
+     "Object", JSON, NULL, NULL},
+    {"GET", "/v1", routes_serve_service, -1, "Version, limits and endpoints", NULL, false, false,
+     200, "Service", JSON, NULL, NULL},
+    {"GET", "/v1/schemas/scene.json", routes_serve_schema, -1, "JSON Schema of a scene", NULL,
+     false, false, 200, "Object", JSON, NULL, NULL},
+    {"GET", "/v1/materials", routes_serve_materials, -1, "Material models with their parameters",
+     NULL, false, false, 200, "Materials", JSON, NULL, NULL},
+    {"GET", "/v1/scenes", routes_serve_scenes, -1, "Built-in scenes", NULL, false, false, 200,
+     "Scenes", JSON, NULL, NULL},
+    {"GET", "/v1/scenes/{name}", routes_serve_scene, -1, "A built-in scene, fit to be posted back",
+     NULL, false, false, 200, "Scene", JSON, NULL, NULL},
+    {"POST", "/v1/scenes:validate", routes_serve_validate, -1,
+     "Every fault of a scene, or its cost", "Validate", true, false, 200, "Valid", JSON, NULL,
+     NULL},
+    {"POST", "/v1/runs", routes_serve_create, -1, "Create a run", "Create", true, false, 201, "Run",
+     JSON, NULL, "409 503 507"},
+    {"GET", "/v1/runs", routes_serve_runs, -1, "All runs, oldest first", NULL, false, false, 200,
+     "Runs", JSON, NULL, NULL},
+    {"GET", "/v1/runs/{id}", routes_serve_run, -1, "A run", NULL, false, false, 200, "Run", JSON,
+     NULL, NULL},
+    {"DELETE", "/v1/runs/{id}", routes_serve_delete, -1, "Remove a finished run and its files",
+     NULL, false, false, 204, NULL, NULL, NULL, "409 507"},
+    ACTION("start", START, "Start a run that was created paused"),
+    ACTION("pause", PAUSE, "Pause, with a checkpoint"),
+    ACTION("resume", RESUME, "Go on"),
+    {"POST", "/v1/runs/{id}:step", routes_serve_action, RUN_DO_STEP,
+     "Run for a number of steps or until a time, then pause", "Step", true, false, 200, "Run", JSON,
+     NULL, "409 503 507"},
+    ACTION("cancel", CANCEL, "End the run where it is"),
+    ACTION("checkpoint", CHECKPOINT, "Write a checkpoint now"),
+    ACTION("snapshot", SNAPSHOT, "Take a frame now"),
+    {"GET", "/v1/runs/{id}/config", routes_serve_config, -1, "What may change while it runs", NULL,
+     false, false, 200, "Config", JSON, NULL, NULL},
+    {"PATCH", "/v1/runs/{id}/config", routes_serve_configure, RUN_DO_CONFIGURE,
+     "Change it, from the next step on", "Patch", true, true, 200, "Config", JSON, NULL,
+     "409 412 503 507"},
+    {"GET", "/v1/runs/{id}/scene", routes_serve_run_scene, -1, "The scene as run", NULL, false,
+     false, 200, "Scene", JSON, NULL, NULL},
+    {"GET", "/v1/runs/{id}/probes", routes_serve_probes, -1, "Time series of all probes", NULL,
+     false, false, 200, "Probes", JSON " text/csv", "since_step: only samples after this step",
+     "400 503"},
+    {"GET", "/v1/runs/{id}/frames", routes_serve_frames, -1, "Index of the frames", NULL, false,
+     false, 200, "Frames", JSON, NULL, NULL},
+    {"GET", "/v1/runs/{id}/frames/{seq}", routes_serve_frame, -1,
+     "A frame by its number, or `latest`: the bytes that were published", NULL, false, false, 200,
+     "Frame", FRAME, NULL, "500"},
+};
+const size_t routes_count = sizeof routes_table / sizeof *routes_table;
+
+// ---- Routing ----------------------------------------------------------------------------------
+
+struct path {
+    size_t count;
+    char segments[SEGMENTS_MAX][ROUTES_SEGMENT]; // decoded
+};
+
+static bool path_split(const char *text, struct path *out) {
+    out->count = 0;
+    if (*text != '/')
+        return false;
+    for (text++;; text++) {
+        size_t n = strcspn(text, "/");
+        if (out->count == SEGMENTS_MAX || n >= ROUTES_SEGMENT)
+            return false;
+        char *segment = out->segments[out->count++];
+        memcpy(segment, text, n);
+        segment[n] = '\0';
+        if (!http_decode(segment))
+            return false;
+        text += n;
+        if (*text == '\0')
+            return true;
+    }
+}
+
+// One segment against one of the pattern; {name} and {name}:verb put what they stand for into
+// `name`.
+static bool segment_matches(const char *pattern, size_t n, const char *segment, char *name,
+                            bool *named) {
+    if (pattern[0] != '{')
+        return strlen(segment) == n && memcmp(segment, pattern, n) == 0;
+    const char *close = memchr(pattern, '}', n);
+    size_t tail = n - (size_t)(close + 1 - pattern), length = strlen(segment);
+    if (length <= tail || memcmp(segment + length - tail, close + 1, tail) != 0)
+        return false;
+    if (tail == 0 && strchr(segment, ':') != NULL)
+        return false; // an action that there is not
+    memcpy(name, segment, length - tail);
+    name[length - tail] = '\0';
+    *named = true;
+    return true;
+}
+
+static bool pattern_matches(const char *pattern, const struct path *path, struct call *call) {
+    size_t names = 0;
+    for (size_t k = 0; k < path->count; k++) {
+        bool named = false;
+        if (*pattern != '/')
+            return false;
+        pattern++;
+        size_t n = strcspn(pattern, "/");
+        if (names == 2 ||
+            !segment_matches(pattern, n, path->segments[k], call->names[names], &named))
+            return false;
+        names += named;
+        pattern += n;
+    }
+    return *pattern == '\0';
+}
+
+// Fills call->route. Else the reply is a 404 or a 405.
+static bool route(struct call *c) {
+    struct path path;
+    char allow[64] = "";
+    const char *method = http_method(c->request);
+    bool head = strcmp(method, "HEAD") == 0;
+    if (!path_split(http_path(c->request), &path)) {
+        reply_problem(c->reply, 404, NULL, "there is nothing at this path");
+        return false;
+    }
+    for (size_t k = 0; k < routes_count; k++) {
+        const struct route *candidate = &routes_table[k];
+        if (!pattern_matches(candidate->pattern, &path, c))
+            continue;
+        if (strcmp(candidate->method, head ? "GET" : method) == 0) {
+            c->route = candidate;
+            return true;
+        }
+        size_t n = strlen(allow);
+        snprintf(allow + n, sizeof allow - n, "%s%s%s", n > 0 ? ", " : "", candidate->method,
+                 strcmp(candidate->method, "GET") == 0 ? ", HEAD" : "");
+    }
+    if (allow[0] == '\0') {
+        reply_problem(c->reply, 404, NULL, "there is nothing at %.200s", http_path(c->request));
+        return false;
+    }
+    reply_problem(c->reply, 405, NULL, "%.16s is not possible here; possible: %s", method, allow);
+    http_reply_header(c->reply, "Allow", "%s", allow);
+    return false;
+}
+
+static const char *guard_detail(int status) {
+    switch (status) {
+    case 401:
+        return "a bearer token is needed: Authorization: Bearer TOKEN";
+    case 403:
+        return "the Origin header names another site";
+    default:
+        return "the Host header does not name this server";
+    }
+}
+
+static bool admit(void *context, struct http_request *request, struct http_reply *reply) {
+    struct routes *routes = context;
+    struct call call = {.routes = routes, .request = request, .reply = reply};
+    int status =
+        guard_verdict(&routes->guard, http_header(request, "Host"), http_header(request, "Origin"),
+                      http_header(request, "Authorization"));
+    if (status != 0) {
+        reply_problem(reply, status, NULL, "%s", guard_detail(status));
+        return false;
+    }
+    if (!route(&call))
+        return false;
+    if (atomic_load(&routes->open) || call.route->serve == routes_serve_health)
+        return true;
+    reply_problem(reply, 503, NULL, "the daemon is reading its earlier runs");
+    return false;
+}
+
+static void too_large(void *context, struct http_reply *reply) {
+    const struct routes *routes = context;
+    reply_problem(reply, 413, NULL, "the body is over the limit of %zu bytes",
+                  routes->options->max_body);
+}
+
+// Media type without its parameters.
+static bool type_is(const char *header, const char *type) {
+    header += strspn(header, " \t");
+    size_t n = strcspn(header, "; \t");
+    return n == strlen(type) && strncasecmp(header, type, n) == 0;
+}
+
+// Parses the body where the route takes one. Else the reply is a 400 or a 415.
+static bool parse_body(struct call *c) {
+    size_t bytes;
+    const char *text = http_body(c->request, &bytes);
+    const char *type = http_header(c->request, "Content-Type");
+    if (c->route->request == NULL || (bytes == 0 && !c->route->request_needed))
+        return true;
+    if (bytes > 0 && type != NULL && !type_is(type, "application/json") &&
+        !(c->route->merge_patch && type_is(type, "application/merge-patch+json"))) {
+        reply_problem(c->reply, 415, NULL, "Content-Type must be application/json%s, got %.80s%s",
+                      c->route->merge_patch ? " or application/merge-patch+json" : "", type,
+                      type_is(type, "application/x-www-form-urlencoded")
+                          ? "; with curl, use --json in the place of -d"
+                          : "");
+        return false;
+    }
+    struct faults faults = {0};
+    if (bytes == 0 && c->route->action == RUN_DO_STEP)
+        c->body = cJSON_CreateObject(); // which then lacks what it needs: 422
+    else
+        c->body = json_parse(text, bytes, &faults);
+    if (c->body == NULL) {
+        reply_faults(c->reply, 400, &faults);
+    } else if (!cJSON_IsObject(c->body)) {
+        faults_add(&faults, "", "type", "object", routes_type_name(c->body), "must be an object");
+        reply_faults(c->reply, 422, &faults);
+        cJSON_Delete(c->body);
+        c->body = NULL;
+    }
+    faults_free(&faults);
+    return c->body != NULL;
+}
+
+static void serve(void *context, struct http_request *request, struct http_reply *reply) {
+    struct call call = {.routes = context, .request = request, .reply = reply};
+    if (!route(&call))
+        return;
+    if (parse_body(&call))
+        call.route->serve(&call);
+    cJSON_Delete(call.body);
+    log_line(LOG_LEVEL_DEBUG, "request", "method=%s path=\"%.200s\" status=%d",
+             http_method(request), http_path(request), reply->status);
+}
+
+struct http_service routes_service(struct routes *routes) {
+    return (struct http_service){.context = routes,
+                                 .max_body = routes->options->max_body,
+                                 .admit = admit,
+                                 .serve = serve,
+                                 .too_large = too_large};
+}

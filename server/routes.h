@@ -1,0 +1,42 @@
+// The HTTP API (docs/api.md): a table of routes, one function each. The table also makes
+// /openapi.json.
+#pragma once
+#include <stdatomic.h>
+
+#include "server/guard.h"
+#include "server/http.h"
+#include "server/options.h"
+#include "server/runs.h"
+
+struct routes {
+    const struct options *options;
+    const struct run_host *host;
+    struct runs *runs;
+    struct guard guard;
+    char http_url[320], publish_url[320];
+    atomic_bool open; // the runs of earlier daemons are listed; until then 503
+};
+
+// What http_start calls; `routes` must outlive the server.
+struct http_service routes_service(struct routes *routes);
+
+// ---- For openapi.c ----------------------------------------------------------------------------
+
+struct call;
+struct route {
+    const char *method,
+        *pattern; // {name} stands for one path segment, {name}:verb for one that ends so
+    void (*serve)(struct call *call);
+    int action; // enum run_action of the routes that post one, else -1
+    const char *summary;
+    const char *request; // schema of the body, NULL = none
+    bool request_needed;
+    bool merge_patch; // application/merge-patch+json is taken as well
+    int success;
+    const char *response; // schema of the success, NULL = no body
+    const char *type;     // its media types, space-separated
+    const char *query;    // "name: what it is", ... separated by newlines, or NULL
+    const char *problems; // statuses of its own, space-separated
+};
+extern const struct route routes_table[];
+extern const size_t routes_count;

@@ -1,0 +1,47 @@
+// What the functions behind the routes share: routes.c calls them, routes_*.c have them.
+#pragma once
+#include "server/reply.h"
+#include "server/routes.h"
+
+#define ROUTES_SEGMENT 256 // bytes of one segment of a path
+
+struct call {
+    struct routes *routes;
+    const struct route *route;
+    struct http_request *request;
+    struct http_reply *reply;
+    char names[2][ROUTES_SEGMENT]; // what stood for {...} in the path
+    cJSON *body;                   // parsed, NULL when there is none
+};
+
+void routes_serve_action(struct call *c);
+void routes_serve_config(struct call *c);
+void routes_serve_configure(struct call *c);
+void routes_serve_create(struct call *c);
+void routes_serve_delete(struct call *c);
+void routes_serve_frame(struct call *c);
+void routes_serve_frames(struct call *c);
+void routes_serve_health(struct call *c);
+void routes_serve_materials(struct call *c);
+void routes_serve_openapi(struct call *c);
+void routes_serve_probes(struct call *c);
+void routes_serve_ready(struct call *c);
+void routes_serve_run(struct call *c);
+void routes_serve_run_scene(struct call *c);
+void routes_serve_runs(struct call *c);
+void routes_serve_scene(struct call *c);
+void routes_serve_scenes(struct call *c);
+void routes_serve_schema(struct call *c);
+void routes_serve_service(struct call *c);
+void routes_serve_validate(struct call *c);
+
+// The run that the path names, retained; NULL when the reply is a 404.
+struct run *routes_run_of(struct call *c);
+// A fault for every key of `body` that is not in `known` (" one two ").
+void routes_unknown_keys(const cJSON *body, const char *known, struct faults *faults);
+const char *routes_type_name(const cJSON *item);
+// {"scene": name or object, "overrides": object}: the merged scene, new; NULL with faults.
+cJSON *routes_merged_scene(const cJSON *body, struct faults *faults);
+// A scene that is valid and fits in memory; NULL with faults, whose pointers begin with `prefix`.
+struct scene *routes_checked_scene(const struct call *c, const cJSON *json, const char *prefix,
+                                   struct mpm_estimate *estimate, struct faults *faults);

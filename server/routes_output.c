@@ -1,0 +1,210 @@
+// Routes that give out what a run has produced: probes and frames.
+#include <math.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "server/log.h"
+#include "server/routes_inside.h"
+
+// ---- Probes -----------------------------------------------------------------------------------
+
+struct rows {
+    const struct series *series;
+    cJSON *step, *time;
+    cJSON **columns;
+    FILE *csv;
+};
+
+static void row_json(void *context, const struct series_row *row) {
+    struct rows *rows = context;
+    cJSON_AddItemToArray(rows->step, cJSON_CreateNumber((double)row->step));
+    cJSON_AddItemToArray(rows->time, json_number(row->time));
+    for (size_t k = 0; k < series_n_columns(rows->series); k++)
+        cJSON_AddItemToArray(rows->columns[k], json_number(row->values[k]));
+}
+
+static void probes_json(struct call *c, struct series *series, bool all, uint64_t after) {
+    cJSON *json = cJSON_CreateObject();
+    struct rows rows = {.series = series,
+                        .step = cJSON_AddArrayToObject(json, "step"),
+                        .time = cJSON_AddArrayToObject(json, "time")};
+    cJSON *probes = cJSON_AddObjectToObject(json, "probes");
+    size_t n = series != NULL ? series_n_probes(series) : 0;
+    rows.columns =
+        calloc(series != NULL ? series_n_columns(series) + 1 : 1, sizeof(struct cJSON *));
+    for (size_t k = 0; k < n && rows.columns != NULL; k++) {
+        const struct series_probe *probe = series_probe(series, k);
+        bool scalar = probe->n_components == 1 && probe->components[0][0] == '\0';
+        cJSON *inside = scalar ? probes : cJSON_AddObjectToObject(probes, probe->name);
+        for (size_t d = 0; d < probe->n_components; d++)
+            rows.columns[probe->column + d] =
+                cJSON_AddArrayToObject(inside, scalar ? probe->name : probe->components[d]);
+    }
+    if (series != NULL && rows.columns != NULL)
+        series_visit(series, all, after, row_json, &rows);
+    free(rows.columns);
+    reply_json(c->reply, 200, json);
+}
+
+static void put_number(FILE *csv, double value) {
+    char digits[40];
+    if (!isfinite(value))
+        return; // an empty field
+    for (int precision = 15; precision <= 17; precision++) {
+        snprintf(digits, sizeof digits, "%.*g", precision, value);
+        if (strtod(digits, NULL) == value)
+            break;
+    }
+    fputs(digits, csv);
+}
+
+// As RFC 4180, but lines end as Unix tools expect: a name with a comma, a quote or a line break is
+// quoted.
+static void put_name(FILE *csv, const char *name, const char *component) {
+    bool quoted = strpbrk(name, ",\"\r\n") != NULL;
+    fputs(quoted ? ",\"" : ",", csv);
+    for (; *name != '\0'; name++) {
+        if (*name == '"')
+            fputc('"', csv);
+        fputc(*name, csv);
+    }
+    if (component[0] != '\0')
+        fprintf(csv, ".%s", component);
+    if (quoted)
+        fputc('"', csv);
+}
+
+static void row_csv(void *context, const struct series_row *row) {
+    struct rows *rows = context;
+    fprintf(rows->csv, "%llu,", (unsigned long long)row->step);
+    put_number(rows->csv, row->time);
+    for (size_t k = 0; k < series_n_columns(rows->series); k++) {
+        fputc(',', rows->csv);
+        put_number(rows->csv, row->values[k]);
+    }
+    fputs("\n", rows->csv);
+}
+
+static void probes_csv(struct call *c, struct series *series, bool all, uint64_t after) {
+    char *text = NULL;
+    size_t bytes = 0;
+    struct rows rows = {.series = series, .csv = open_memstream(&text, &bytes)};
+    if (rows.csv == NULL) {
+        reply_problem(c->reply, 503, NULL, "out of memory");
+        return;
+    }
+    fputs("step,time", rows.csv);
+    for (size_t k = 0; series != NULL && k < series_n_probes(series); k++)
+        for (size_t d = 0; d < series_probe(series, k)->n_components; d++)
+            put_name(rows.csv, series_probe(series, k)->name,
+                     series_probe(series, k)->components[d]);
+    fputs("\n", rows.csv);
+    if (series != NULL)
+        series_visit(series, all, after, row_csv, &rows);
+    fclose(rows.csv);
+    reply_text(c->reply, 200, "text/csv; charset=utf-8", text);
+}
+
+void routes_serve_probes(struct call *c) {
+    char since[32];
+    uint64_t after = 0;
+    bool all = true;
+    if (http_query(c->request, "since_step", since, sizeof since)) {
+        all = false;
+        if (since[0] == '\0' || strlen(since) > 19 ||
+            strspn(since, "0123456789") != strlen(since)) {
+            reply_problem(c->reply, 400, NULL, "since_step must be a whole number, 0 or more");
+            return;
+        }
+        after = strtoull(since, NULL, 10);
+    }
+    struct run *run = routes_run_of(c);
+    if (run == NULL)
+        return;
+    const char *accept = http_header(c->request, "Accept");
+    const char *csv = accept != NULL ? strstr(accept, "text/csv") : NULL;
+    const char *json = accept != NULL ? strstr(accept, "application/json") : NULL;
+    if (csv != NULL && (json == NULL || csv < json))
+        probes_csv(c, run_series(run), all, after);
+    else
+        probes_json(c, run_series(run), all, after);
+    http_reply_header(c->reply, "Vary", "Accept");
+    run_release(run);
+}
+
+// ---- Frames -----------------------------------------------------------------------------------
+
+void routes_serve_frames(struct call *c) {
+    struct run *run = routes_run_of(c);
+    if (run == NULL)
+        return;
+    struct journal *journal = run_journal(run);
+    struct journal_frame frame;
+    cJSON *json = cJSON_CreateObject();
+    uint64_t first = journal != NULL ? journal_n_gone(journal) : 0;
+    reply_add(json, "first", (double)first); // those before it were dropped for want of room
+    cJSON *list = cJSON_AddArrayToObject(json, "frames");
+    for (uint64_t seq = first; journal != NULL && journal_frame(journal, seq, &frame); seq++) {
+        char digest[24];
+        cJSON *item = cJSON_CreateObject();
+        snprintf(digest, sizeof digest, "%016llx", (unsigned long long)frame.digest);
+        reply_add(item, "seq", (double)frame.seq);
+        reply_add(item, "step", (double)frame.step);
+        reply_add(item, "time", frame.time);
+        reply_add(item, "bytes", (double)frame.bytes);
+        reply_add(item, "epoch", frame.epoch);
+        cJSON_AddStringToObject(
+            item, "state",
+            frame.state < RUN_N_STATES ? run_state_name((enum run_state)frame.state) : "");
+        cJSON_AddBoolToObject(item, "end", frame.end);
+        cJSON_AddStringToObject(item, "digest", digest);
+        cJSON_AddItemToArray(list, item);
+    }
+    reply_json(c->reply, 200, json);
+    run_release(run);
+}
+
+static void reply_frame(struct call *c, struct run *run) {
+    struct journal *journal = run_journal(run);
+    struct journal_frame frame;
+    char why[JOURNAL_WHY];
+    uint64_t n = journal != NULL ? journal_n_frames(journal) : 0, seq = n - 1;
+    const char *text = c->names[1];
+    bool latest = strcmp(text, "latest") == 0;
+    bool number = !latest && text[0] != '\0' && strlen(text) <= 19 &&
+                  strspn(text, "0123456789") == strlen(text);
+    if (number)
+        seq = strtoull(text, NULL, 10);
+    if ((!latest && !number) || seq >= n) {
+        reply_problem(c->reply, 404, NULL, "run %.80s has no frame %.40s; it has %llu so far",
+                      c->names[0], text, (unsigned long long)n);
+        return;
+    }
+    int fd = journal_frame_open(journal, seq, &frame, why);
+    if (fd < 0 && frame.gone) {
+        reply_problem(c->reply, 404, NULL, "frame %.40s of run %.80s was dropped for want of room",
+                      text, c->names[0]);
+        return;
+    }
+    if (fd < 0) {
+        log_error("frame", "run=%s why=\"%s\"", c->names[0], why);
+        reply_problem(c->reply, 500, NULL, "%s", why);
+        return;
+    }
+    c->reply->status = 200;
+    c->reply->type = "application/vnd.fbard.frame";
+    c->reply->fd = fd;
+    c->reply->offset = frame.offset;
+    c->reply->bytes = frame.bytes;
+    http_reply_header(c->reply, "ETag", "\"%016llx\"", (unsigned long long)frame.digest);
+    http_reply_header(c->reply, "Fbard-Seq", "%llu", (unsigned long long)seq);
+}
+
+void routes_serve_frame(struct call *c) {
+    struct run *run = routes_run_of(c);
+    if (run == NULL)
+        return;
+    reply_frame(c, run);
+    run_release(run);
+}

@@ -1,0 +1,419 @@
+// Routes about runs: create, look, act, configure, delete. Each posts one command or reads one
+// status.
+#include <math.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "server/history.h"
+#include "server/routes_inside.h"
+
+// ---- Run objects ------------------------------------------------------------------------------
+
+static cJSON *accuracy_json(struct run *run, const struct run_status *status) {
+    size_t count;
+    const struct run_reference *references = run_references(run, &count);
+    struct series *series = run_series(run);
+    cJSON *list = cJSON_CreateArray();
+    for (size_t k = 0; k < count; k++) {
+        const struct run_reference *r = &references[k];
+        double value = NAN;
+        const struct series_probe *probe = series != NULL && r->probe < series_n_probes(series)
+                                               ? series_probe(series, r->probe)
+                                               : NULL;
+        if (probe != NULL && (size_t)r->component < probe->n_components) {
+            size_t column = probe->column + (size_t)r->component;
+            bool ended = status->state == RUN_COMPLETED;
+            if (!r->at_end || ended)
+                series_at_time(series, column, r->at_end ? status->time : r->at, &value);
+        }
+        cJSON *item = cJSON_CreateObject();
+        cJSON_AddStringToObject(item, "probe", r->name);
+        if (probe != NULL && (size_t)r->component < probe->n_components &&
+            probe->components[r->component][0] != '\0')
+            cJSON_AddStringToObject(item, "component", probe->components[r->component]);
+        if (r->at_end)
+            cJSON_AddStringToObject(item, "at", "end");
+        else
+            reply_add(item, "at", r->at);
+        reply_add(item, "value", value);
+        reply_add(item, "reference", r->value);
+        reply_add(item, "relative_error", fabs(value - r->value) / fabs(r->value));
+        reply_add(item, "tolerance", r->tolerance);
+        cJSON_AddStringToObject(item, "source", r->source);
+        cJSON_AddItemToArray(list, item);
+    }
+    return list;
+}
+
+static cJSON *vector_json(const double *values, int from, int to) {
+    cJSON *list = cJSON_CreateArray();
+    for (int d = from; d < to; d++)
+        cJSON_AddItemToArray(list, json_number(values[d]));
+    return list;
+}
+
+static cJSON *balance_json(const struct run_status *status) {
+    const struct mpm_balance *balance = &status->balance;
+    cJSON *json = cJSON_CreateObject();
+    reply_add(json, "mass", balance->mass);
+    cJSON_AddItemToObject(json, "momentum", vector_json(balance->momentum, 0, MPM_MAX_DIM));
+    cJSON_AddItemToObject(json, "angular_momentum",
+                          vector_json(balance->angular_momentum, 0, MPM_MAX_DIM));
+    reply_add(json, "kinetic_energy", balance->kinetic_energy);
+    reply_add(json, "strain_energy", balance->strain_energy);
+    reply_add(json, "potential_energy", balance->potential_energy);
+    reply_add(json, "external_work", balance->external_work);
+    reply_add(json, "step", (double)status->balance_step);
+    return json;
+}
+
+static cJSON *performance_json(const struct run_status *status) {
+    cJSON *json = cJSON_CreateObject(), *phases;
+    double work = (double)status->particles * (double)status->step;
+    reply_add(json, "wall_s", status->wall_s);
+    reply_add(json, "particle_steps_per_s", status->wall_s > 0 ? work / status->wall_s : NAN);
+    reply_add(json, "bytes_per_particle",
+              status->particles > 0 ? (double)status->bytes / (double)status->particles : NAN);
+    phases = cJSON_AddObjectToObject(json, "phases");
+    for (int k = 0; k < RUN_N_PHASES; k++)
+        reply_add(phases, run_phase_name(k), status->phases[k]);
+    return json;
+}
+
+static cJSON *error_json(const struct run_error *error) {
+    cJSON *json = history_error(error);
+    if (error->present) {
+        cJSON_AddStringToObject(json, "type", "about:blank");
+        cJSON_AddStringToObject(json, "title", "Run Failed");
+    }
+    return json;
+}
+
+static double progress_of(const struct run_status *status) {
+    double span = status->end_time - status->start_time;
+    double done = span > 0 ? (status->time - status->start_time) / span : 0;
+    if (status->state == RUN_COMPLETED)
+        return 1;
+    return done > 0 ? (done < 1 ? done : 1) : 0; // 0 for NaN as well
+}
+
+static cJSON *run_json(struct run *run) {
+    struct run_status status = run_status(run);
+    struct series *series = run_series(run);
+    cJSON *json = cJSON_CreateObject(), *warnings;
+    cJSON_AddStringToObject(json, "id", run_id(run));
+    cJSON_AddStringToObject(json, "state", run_state_name(status.state));
+    reply_add(json, "step", (double)status.step);
+    reply_add(json, "time", status.time);
+    reply_add(json, "start_time", status.start_time);
+    reply_add(json, "end_time", status.end_time);
+    reply_add(json, "stage", (double)status.stage);
+    reply_add(json, "progress", progress_of(&status));
+    reply_add(json, "eta_s", status.eta_s);
+    reply_add(json, "dt", status.dt);
+    reply_add(json, "dt_limit", status.dt_limit);
+    cJSON_AddBoolToObject(json, "fbar", status.fbar);
+    cJSON_AddStringToObject(json, "fbar_scheme", mpm_fbar_name(status.fbar_scheme));
+    reply_add(json, "particles", (double)status.particles);
+    reply_add(json, "nodes", (double)status.nodes);
+    cJSON_AddStringToObject(json, "scene", run_name(run));
+    cJSON_AddStringToObject(json, "created", run_created(run));
+    reply_add(json, "epoch", (double)status.epoch);
+    cJSON_AddItemToObject(json, "error", error_json(&status.error));
+    warnings = cJSON_AddArrayToObject(json, "warnings");
+    for (unsigned k = 0; k < status.n_warnings; k++)
+        cJSON_AddItemToArray(warnings, cJSON_CreateString(status.warnings[k]));
+    cJSON_AddItemToObject(json, "performance", performance_json(&status));
+    cJSON_AddItemToObject(json, "balance", balance_json(&status));
+    cJSON_AddItemToObject(
+        json, "probes", series != NULL ? series_values(series, UINT64_MAX) : cJSON_CreateObject());
+    cJSON_AddItemToObject(json, "accuracy", accuracy_json(run, &status));
+    return json;
+}
+
+// The run that the path names, retained; NULL when the reply is a 404.
+struct run *routes_run_of(struct call *c) {
+    struct run *run = runs_find(c->routes->runs, c->names[0]);
+    if (run == NULL)
+        reply_problem(c->reply, 404, NULL, "there is no run %.80s", c->names[0]);
+    return run;
+}
+
+void routes_serve_runs(struct call *c) {
+    size_t count;
+    struct run **all = runs_all(c->routes->runs, &count);
+    cJSON *json = cJSON_CreateObject(), *list = cJSON_AddArrayToObject(json, "runs");
+    for (size_t k = 0; k < count; k++) {
+        cJSON_AddItemToArray(list, run_json(all[k]));
+        run_release(all[k]);
+    }
+    free(all);
+    reply_json(c->reply, 200, json);
+}
+
+void routes_serve_run(struct call *c) {
+    struct run *run = routes_run_of(c);
+    if (run == NULL)
+        return;
+    reply_json(c->reply, 200, run_json(run));
+    run_release(run);
+}
+
+void routes_serve_delete(struct call *c) {
+    enum run_state state = RUN_QUEUED;
+    char why[JOURNAL_WHY] = "";
+    switch (runs_remove(c->routes->runs, c->names[0], &state, why)) {
+    case RUNS_REMOVED:
+        c->reply->status = 204;
+        break;
+    case RUNS_MISSING:
+        reply_problem(c->reply, 404, NULL, "there is no run %.80s", c->names[0]);
+        break;
+    case RUNS_ALIVE:
+        reply_problem(c->reply, 409, NULL, "run %.80s is %s: cancel it first", c->names[0],
+                      run_state_name(state));
+        break;
+    case RUNS_REMOVAL_FAILED:
+        reply_problem(c->reply, 507, NULL, "%s", why);
+        break;
+    }
+}
+
+// ---- Creating ---------------------------------------------------------------------------------
+
+static void check_create(const cJSON *body, struct run_definition *out, struct faults *faults) {
+    const cJSON *id = json_member(body, "id"), *start = json_member(body, "start");
+    const cJSON *wait = json_member(body, "wait_subscribers");
+    routes_unknown_keys(body, " scene overrides id start wait_subscribers ", faults);
+    if (id != NULL && !cJSON_IsString(id))
+        faults_add(faults, "/id", "type", "string", routes_type_name(id), "must be a string");
+    else if (id != NULL && !runs_id_valid(id->valuestring))
+        faults_add(faults, "/id", "pattern", "[A-Za-z0-9][A-Za-z0-9._-]{0,63}", NULL,
+                   "must begin with a letter or digit and have at most %d letters, digits, dots, "
+                   "dashes and underscores",
+                   RUN_ID_MAX);
+    else if (id != NULL)
+        out->id = id->valuestring;
+    if (start != NULL && !cJSON_IsBool(start))
+        faults_add(faults, "/start", "type", "boolean", routes_type_name(start),
+                   "must be true or false");
+    out->start = start == NULL || cJSON_IsTrue(start);
+    if (wait == NULL)
+        return;
+    if (!cJSON_IsNumber(wait) || wait->valuedouble < 0 ||
+        wait->valuedouble != floor(wait->valuedouble))
+        faults_add(faults, "/wait_subscribers", "type", "integer >= 0", routes_type_name(wait),
+                   "must be a whole number, 0 or more");
+    else if (wait->valuedouble != 0)
+        faults_add(faults, "/wait_subscribers", "unsupported", "0", NULL,
+                   "this version does not wait for subscribers");
+}
+
+static void reply_created(struct call *c, struct run *run) {
+    reply_json(c->reply, 201, run_json(run));
+    http_reply_header(c->reply, "Location", "/v1/runs/%s", run_id(run));
+    run_release(run);
+}
+
+void routes_serve_create(struct call *c) {
+    struct faults faults = {0};
+    struct run_definition definition = {0};
+    struct mpm_estimate estimate;
+    struct run *run = NULL, *twin = NULL;
+    char why[JOURNAL_WHY] = "";
+    check_create(c->body, &definition, &faults);
+    cJSON *merged = routes_merged_scene(c->body, &faults);
+    struct scene *scene =
+        merged != NULL ? routes_checked_scene(c, merged, "/scene", &estimate, &faults) : NULL;
+    if (scene == NULL || faults.count > 0) {
+        reply_faults(c->reply, 422, &faults);
+        goto done;
+    }
+    const char *named = cJSON_GetStringValue(json_member(c->body, "scene"));
+    definition.name = named != NULL ? named : scene_title(scene);
+    definition.scene = scene;
+    switch (runs_add(c->routes->runs, &definition, &run, why)) {
+    case RUNS_CREATED:
+        scene = NULL;
+        reply_created(c, run);
+        break;
+    case RUNS_DUPLICATE:
+        twin = runs_find(c->routes->runs, definition.id);
+        reply_problem(c->reply, 409, NULL, "%s, and it is %s", why,
+                      twin != NULL ? run_state_name(run_status(twin).state) : "gone by now");
+        run_release(twin);
+        break;
+    case RUNS_FULL:
+    case RUNS_STOPPED:
+        reply_problem(c->reply, 503, NULL, "%s", why);
+        break;
+    case RUNS_STORAGE:
+        reply_problem(c->reply, 507, NULL, "%s", why);
+        break;
+    }
+done:
+    scene_free(scene);
+    cJSON_Delete(merged);
+    faults_free(&faults);
+}
+
+// ---- Actions ----------------------------------------------------------------------------------
+
+static bool step_body(const cJSON *body, struct run_command *command, struct faults *faults) {
+    const cJSON *steps = json_member(body, "steps"), *until = json_member(body, "until");
+    routes_unknown_keys(body, " steps until ", faults);
+    if ((steps != NULL) == (until != NULL))
+        faults_add(faults, "", steps == NULL ? "required" : "conflict", "steps or until", NULL,
+                   "must have one of steps and until");
+    if (steps != NULL && (!cJSON_IsNumber(steps) || steps->valuedouble < 1 ||
+                          steps->valuedouble != floor(steps->valuedouble)))
+        faults_add(faults, "/steps", cJSON_IsNumber(steps) ? "range" : "type", "integer >= 1",
+                   cJSON_IsNumber(steps) ? NULL : routes_type_name(steps),
+                   "must be a whole number, 1 or more");
+    if (until != NULL && !cJSON_IsNumber(until))
+        faults_add(faults, "/until", "type", "number", routes_type_name(until),
+                   "must be a time in s");
+    if (faults->count > 0)
+        return false;
+    // 2^53: beyond that a double holds no whole numbers, and no run does as many steps
+    command->steps = steps != NULL ? (uint64_t)fmin(steps->valuedouble, 9007199254740992.0) : 0;
+    command->until = until != NULL ? until->valuedouble : NAN;
+    return true;
+}
+
+// The reply to a command that was not carried out.
+static void refuse(struct call *c, const struct run_command *command) {
+    const char *name = run_action_name(command->action);
+    switch (command->outcome) {
+    case RUN_DONE:
+        break;
+    case RUN_ILLEGAL:
+        reply_problem(c->reply, 409, NULL, "run %.80s is %s: it cannot %s", c->names[0],
+                      run_state_name(command->state), name);
+        break;
+    case RUN_INVALID:
+        reply_faults(c->reply, 422, &command->faults);
+        break;
+    case RUN_STALE:
+        reply_problem(c->reply, 412, NULL,
+                      "the configuration has changed meanwhile: read it again");
+        break;
+    case RUN_BUSY:
+        reply_problem(c->reply, 503, NULL, "%s", command->why);
+        break;
+    case RUN_STORAGE:
+        reply_problem(c->reply, 507, NULL, "%s", command->why);
+        break;
+    case RUN_STOPPING:
+        reply_problem(c->reply, 503, NULL, "the daemon is ending");
+        break;
+    }
+}
+
+void routes_serve_action(struct call *c) {
+    struct run_command command = {.action = (enum run_action)c->route->action};
+    struct faults faults = {0};
+    struct run *run = routes_run_of(c);
+    if (run == NULL)
+        return;
+    if (command.action == RUN_DO_STEP)
+        step_body(c->body, &command, &faults);
+    else
+        routes_unknown_keys(c->body, " ", &faults);
+    if (faults.count > 0) {
+        reply_faults(c->reply, 422, &faults);
+    } else {
+        run_command(run, &command);
+        if (command.outcome == RUN_DONE) {
+            cJSON *json = run_json(run);
+            reply_add(json, "effective_step", (double)command.effective_step);
+            if (command.action == RUN_DO_SNAPSHOT)
+                reply_add(json, "frame_seq", (double)command.frame_seq);
+            reply_json(c->reply, 200, json);
+        } else {
+            refuse(c, &command);
+        }
+    }
+    faults_free(&command.faults);
+    faults_free(&faults);
+    run_release(run);
+}
+
+// ---- Configuration ----------------------------------------------------------------------------
+
+static void reply_config(struct call *c, struct run *run, const struct run_command *command) {
+    uint64_t revision;
+    char *text = run_config_text(run, &revision);
+    if (text == NULL) {
+        reply_problem(c->reply, 404, NULL, "run %.80s has no configuration that can be read",
+                      c->names[0]);
+        return;
+    }
+    if (command != NULL) {
+        struct faults faults = {0};
+        cJSON *json = json_parse(text, strlen(text), &faults);
+        reply_add(json, "effective_step", (double)command->effective_step);
+        free(text);
+        text = json_print(json, false);
+        cJSON_Delete(json);
+        faults_free(&faults);
+    }
+    reply_text(c->reply, 200, "application/json", text);
+    http_reply_header(c->reply, "ETag", "\"%llu\"", (unsigned long long)revision);
+}
+
+void routes_serve_config(struct call *c) {
+    struct run *run = routes_run_of(c);
+    if (run == NULL)
+        return;
+    reply_config(c, run, NULL);
+    run_release(run);
+}
+
+// Whether one of the entity tags in an If-Match header is that of `revision`.
+static bool tag_matches(const char *header, uint64_t revision) {
+    char tag[32];
+    snprintf(tag, sizeof tag, "\"%llu\"", (unsigned long long)revision);
+    for (const char *at = header; at != NULL; at = strchr(at, ',')) {
+        at += strspn(at, ", \t");
+        if (*at == '*' || strncmp(at, tag, strlen(tag)) == 0)
+            return true;
+    }
+    return false;
+}
+
+void routes_serve_configure(struct call *c) {
+    struct run_command command = {.action = RUN_DO_CONFIGURE, .patch = c->body};
+    const char *match = http_header(c->request, "If-Match");
+    struct run *run = routes_run_of(c);
+    if (run == NULL)
+        return;
+    command.state = RUN_N_STATES;
+    if (match != NULL && strchr(match, '*') == NULL) {
+        command.has_revision = true;
+        command.revision = run_status(run).revision;
+    }
+    if (command.has_revision && !tag_matches(match, command.revision))
+        command.outcome = RUN_STALE;
+    else
+        run_command(run, &command);
+    if (command.outcome == RUN_DONE)
+        reply_config(c, run, &command);
+    else
+        refuse(c, &command);
+    faults_free(&command.faults);
+    run_release(run);
+}
+
+void routes_serve_run_scene(struct call *c) {
+    struct run *run = routes_run_of(c);
+    if (run == NULL)
+        return;
+    char *text = run_scene_text(run);
+    if (text == NULL)
+        reply_problem(c->reply, 404, NULL, "run %.80s has no scene that can be read", c->names[0]);
+    else
+        reply_text(c->reply, 200, "application/json", text);
+    run_release(run);
+}

@@ -1,0 +1,256 @@
+// Routes about the daemon itself, its materials and scenes, and scenes in a body.
+#include <stdio.h>
+#include <string.h>
+
+#include "server/openapi.h"
+#include "server/routes_inside.h"
+
+// ---- The daemon itself ------------------------------------------------------------------------
+
+void routes_serve_health(struct call *c) {
+    cJSON *json = cJSON_CreateObject();
+    cJSON_AddStringToObject(json, "status", "ok");
+    reply_json(c->reply, 200, json);
+}
+
+void routes_serve_ready(struct call *c) {
+    if (!runs_ready(c->routes->runs)) {
+        reply_problem(c->reply, 503, NULL, "no room for another run now");
+        return;
+    }
+    cJSON *json = cJSON_CreateObject();
+    cJSON_AddStringToObject(json, "status", "ready");
+    reply_json(c->reply, 200, json);
+}
+
+void routes_serve_openapi(struct call *c) {
+    reply_json(c->reply, 200, openapi_document());
+}
+
+static const char *instruction_set(void) {
+#if defined(__AVX512F__)
+    return "avx512";
+#elif defined(__AVX2__)
+    return "avx2";
+#elif defined(__x86_64__)
+    return "x86-64";
+#elif defined(__aarch64__)
+    return "aarch64";
+#else
+    return "generic";
+#endif
+}
+
+void routes_serve_service(struct call *c) {
+    const struct options *options = c->routes->options;
+    cJSON *json = cJSON_CreateObject(), *limits, *endpoints;
+    cJSON_AddStringToObject(json, "name", "fbard");
+    cJSON_AddStringToObject(json, "version", FBARD_VERSION);
+    cJSON_AddStringToObject(json, "build", "C17, " __VERSION__);
+    cJSON_AddStringToObject(json, "instruction_set", instruction_set());
+    cJSON_AddNumberToObject(json, "threads", options->threads);
+    cJSON_AddNumberToObject(json, "slots", options->slots);
+    limits = cJSON_AddObjectToObject(json, "limits");
+    reply_add(limits, "body_bytes", (double)options->max_body);
+    reply_add(limits, "memory_bytes", (double)options->memory_limit);
+    reply_add(limits, "queue", options->queue);
+    reply_add(limits, "json_depth", JSON_MAX_DEPTH);
+    endpoints = cJSON_AddObjectToObject(json, "endpoints");
+    cJSON_AddStringToObject(endpoints, "http", c->routes->http_url);
+    cJSON_AddStringToObject(endpoints, "publish", c->routes->publish_url);
+    reply_json(c->reply, 200, json);
+}
+
+void routes_serve_schema(struct call *c) {
+    reply_json(c->reply, 200, scene_schema());
+}
+
+void routes_serve_materials(struct call *c) {
+    reply_json(c->reply, 200, scene_materials_json());
+}
+
+void routes_serve_scenes(struct call *c) {
+    cJSON *json = cJSON_CreateObject(), *list = cJSON_AddArrayToObject(json, "scenes");
+    for (size_t k = 0; k < scene_builtin_count(); k++) {
+        cJSON *item = cJSON_CreateObject(), *scene = scene_builtin(scene_builtin_name(k));
+        const char *title = cJSON_GetStringValue(json_member(scene, "title"));
+        const cJSON *dimension = json_member(scene, "dimension");
+        cJSON_AddStringToObject(item, "name", scene_builtin_name(k));
+        cJSON_AddStringToObject(item, "title", title != NULL ? title : "");
+        if (cJSON_IsNumber(dimension))
+            reply_add(item, "dimension", dimension->valuedouble);
+        cJSON_AddItemToArray(list, item);
+        cJSON_Delete(scene);
+    }
+    reply_json(c->reply, 200, json);
+}
+
+void routes_serve_scene(struct call *c) {
+    cJSON *scene = scene_builtin(c->names[0]);
+    if (scene == NULL)
+        reply_problem(c->reply, 404, NULL, "there is no built-in scene %.80s", c->names[0]);
+    else
+        reply_json(c->reply, 200, scene);
+}
+
+// ---- Scenes in a body -------------------------------------------------------------------------
+
+// Adds the faults of a scene, with their pointers below `prefix` of the body.
+static void faults_below(struct faults *to, const char *prefix, const struct faults *from) {
+    for (size_t k = 0; k < from->count; k++) {
+        const struct fault *fault = &from->items[k];
+        char pointer[512];
+        snprintf(pointer, sizeof pointer, "%s%.400s", prefix, fault->pointer);
+        faults_add(to, pointer, fault->code, fault->expected, fault->actual, "%s", fault->detail);
+    }
+    to->more += from->more;
+}
+
+const char *routes_type_name(const cJSON *item) {
+    return cJSON_IsString(item)   ? "string"
+           : cJSON_IsNumber(item) ? "number"
+           : cJSON_IsObject(item) ? "object"
+           : cJSON_IsArray(item)  ? "array"
+           : cJSON_IsBool(item)   ? "boolean"
+                                  : "null";
+}
+
+void routes_unknown_keys(const cJSON *body, const char *known, struct faults *faults) {
+    const cJSON *item;
+    cJSON_ArrayForEach(item, body) {
+        char pointer[300] = "", word[80];
+        snprintf(word, sizeof word, " %.70s ", item->string);
+        if (strchr(item->string, ' ') == NULL && strstr(known, word) != NULL)
+            continue;
+        json_pointer_append(pointer, sizeof pointer, item->string);
+        faults_add(faults, pointer, "unknown_key", known + 1, item->string,
+                   "unknown key; the keys here are:%s", known);
+    }
+}
+
+// The name that shares most letters in order; to be told what was meant is worth this much.
+static const char *nearest_scene(const char *name) {
+    const char *best = NULL;
+    size_t best_score = 0;
+    for (size_t k = 0; k < scene_builtin_count(); k++) {
+        const char *candidate = scene_builtin_name(k), *at = candidate;
+        size_t score = 0;
+        for (const char *c = name; *c != '\0'; c++) {
+            const char *hit = strchr(at, *c);
+            if (hit != NULL) {
+                score++;
+                at = hit + 1;
+            }
+        }
+        if (2 * score > strlen(candidate) && score > best_score) {
+            best = candidate;
+            best_score = score;
+        }
+    }
+    return best;
+}
+
+static cJSON *builtin_named(const char *name, struct faults *faults) {
+    cJSON *scene = scene_builtin(name);
+    if (scene != NULL)
+        return scene;
+    char list[512] = "one of", actual[96];
+    for (size_t k = 0; k < scene_builtin_count(); k++) {
+        size_t n = strlen(list);
+        snprintf(list + n, sizeof list - n, " %s", scene_builtin_name(k));
+    }
+    const char *near = nearest_scene(name);
+    snprintf(actual, sizeof actual, "%.90s", name);
+    if (near != NULL)
+        faults_add(faults, "/scene", "unknown_scene", list, actual,
+                   "there is no built-in scene %.90s; did you mean %s?", name, near);
+    else
+        faults_add(faults, "/scene", "unknown_scene", list, actual,
+                   "there is no built-in scene %.90s", name);
+    return NULL;
+}
+
+// {"scene": name or object, "overrides": object}: the merged scene, new; NULL with faults.
+cJSON *routes_merged_scene(const cJSON *body, struct faults *faults) {
+    const cJSON *given = json_member(body, "scene"), *overrides = json_member(body, "overrides");
+    cJSON *scene = NULL;
+    if (given == NULL)
+        faults_add(faults, "/scene", "required", "a built-in scene's name, or a scene", NULL,
+                   "is missing");
+    else if (cJSON_IsString(given))
+        scene = builtin_named(given->valuestring, faults);
+    else if (cJSON_IsObject(given))
+        scene = cJSON_Duplicate(given, true);
+    else
+        faults_add(faults, "/scene", "type", "string or object", routes_type_name(given),
+                   "must be a built-in scene's name, or a scene");
+    if (overrides == NULL)
+        return scene;
+    if (!cJSON_IsObject(overrides)) {
+        faults_add(faults, "/overrides", "type", "object", routes_type_name(overrides),
+                   "must be a merge patch on the scene: an object");
+        cJSON_Delete(scene);
+        return NULL;
+    }
+    if (scene == NULL)
+        return NULL;
+    cJSON *merged = json_merge_patch(scene, overrides);
+    cJSON_Delete(scene);
+    return merged;
+}
+
+// A scene that is valid and fits in memory; NULL with faults.
+struct scene *routes_checked_scene(const struct call *c, const cJSON *json, const char *prefix,
+                                   struct mpm_estimate *estimate, struct faults *faults) {
+    struct faults inner = {0};
+    struct scene *scene = scene_create(json, &inner);
+    faults_below(faults, prefix, &inner);
+    faults_free(&inner);
+    if (scene == NULL)
+        return NULL;
+    mpm_estimate(scene_def(scene), estimate);
+    size_t limit = c->routes->host->memory_limit;
+    if (estimate->bytes > limit) {
+        char expected[64], actual[64];
+        snprintf(expected, sizeof expected, "<= %zu bytes", limit);
+        snprintf(actual, sizeof actual, "%zu bytes", estimate->bytes);
+        faults_add(faults, prefix, "memory", expected, actual,
+                   "%zu particles and %zu nodes need %zu bytes; this daemon gives %zu",
+                   estimate->particles, estimate->nodes, estimate->bytes, limit);
+        scene_free(scene);
+        return NULL;
+    }
+    return scene;
+}
+
+void routes_serve_validate(struct call *c) {
+    struct faults faults = {0};
+    struct mpm_estimate estimate;
+    bool bare = json_member(c->body, "scene") == NULL;
+    cJSON *merged = NULL;
+    if (!bare) {
+        routes_unknown_keys(c->body, " scene overrides ", &faults);
+        merged = routes_merged_scene(c->body, &faults);
+    }
+    struct scene *scene = NULL;
+    if (bare || merged != NULL)
+        scene = routes_checked_scene(c, bare ? c->body : merged, bare ? "" : "/scene", &estimate,
+                                     &faults);
+    if (scene == NULL || faults.count > 0) {
+        reply_faults(c->reply, 422, &faults);
+    } else {
+        cJSON *json = cJSON_CreateObject(), *costs;
+        cJSON_AddTrueToObject(json, "valid");
+        costs = cJSON_AddObjectToObject(json, "estimate");
+        reply_add(costs, "particles", (double)estimate.particles);
+        reply_add(costs, "nodes", (double)estimate.nodes);
+        reply_add(costs, "dt", estimate.dt);
+        reply_add(costs, "dt_limit", estimate.dt_limit);
+        reply_add(costs, "steps", (double)estimate.steps);
+        reply_add(costs, "bytes", (double)estimate.bytes);
+        reply_json(c->reply, 200, json);
+    }
+    scene_free(scene);
+    cJSON_Delete(merged);
+    faults_free(&faults);
+}

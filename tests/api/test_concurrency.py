@@ -1,0 +1,177 @@
+"""Many clients at once: nothing is lost, nothing blocks."""
+import concurrent.futures
+import random
+import time
+
+import pytest
+from boxes import big, endless, water
+from fbard import FINAL, STATES, is_sanitized, until
+
+
+def test_hammered_runs_stay_consistent(daemon):
+    runs = [daemon.create(endless())["id"] for _ in range(2)]
+    end = time.monotonic() + 2
+    settled = {200, 409, 412, 422, 503}
+
+    def client(seed):
+        random_ = random.Random(seed)
+        counts, steps = {}, dict.fromkeys(runs, 0)
+        while time.monotonic() < end:
+            run = random_.choice(runs)
+            what = random_.randrange(10)
+            if what < 4:
+                reply = daemon.request("GET", f"/v1/runs/{run}")
+                now = reply.json
+                assert now["state"] in STATES
+                assert now["step"] >= steps[run], "time does not go back"
+                steps[run] = now["step"]
+            elif what < 7:
+                action = random_.choice(["pause", "resume", "start", "snapshot", "checkpoint"])
+                reply = daemon.request("POST", f"/v1/runs/{run}:{action}")
+            elif what < 8:
+                reply = daemon.request("POST", f"/v1/runs/{run}:step", {"steps": random_.randrange(1, 50)})
+            elif what < 9:
+                patch = random_.choice([{"fbar": True}, {"fbar": False}, {"damping": {"mass": random_.random()}},
+                                        {"time": {"dt": 1e-3 * random_.random() + 1e-5}}, {"cell": 1}])  # fmt: skip
+                reply = daemon.request("PATCH", f"/v1/runs/{run}/config", patch)
+            else:
+                reply = daemon.request("GET", random_.choice(["/v1/runs", f"/v1/runs/{run}/probes", "/v1",
+                                                              f"/v1/runs/{run}/frames/latest"]))  # fmt: skip
+            assert reply.status in settled, reply
+            counts[reply.status] = counts.get(reply.status, 0) + 1
+        return counts
+
+    with concurrent.futures.ThreadPoolExecutor(8) as pool:
+        counts = list(pool.map(client, range(8)))
+    assert sum(c.get(200, 0) for c in counts) > 100
+    for run in runs:
+        daemon.act(run, "pause")
+        daemon.patch(run, {"fbar": False, "damping": {"mass": 0}, "time": {"dt": 1e-3}})
+        now = daemon.run(run)
+        assert now["state"] == "paused" and now["error"] is None
+        assert daemon.get(f"/v1/runs/{run}/config")["time"]["dt"] == 1e-3
+        daemon.act(run, "step", {"steps": 10})
+        assert daemon.wait(run, "paused")["step"] == now["step"] + 10
+        index = daemon.frames(run)
+        assert [f["seq"] for f in index] == list(range(len(index)))
+    daemon.away(*runs)
+
+
+def test_watching_changes_no_result(daemon):
+    scene = water(time={"end": 0.5 if is_sanitized() else 2}, output={"interval": 0.1})
+    alone = daemon.create(scene)["id"]
+    daemon.wait(alone, "completed")
+    watched = daemon.create(scene)["id"]
+
+    def watch(_):
+        while daemon.run(watched)["state"] not in FINAL:
+            for action in ("pause", "snapshot", "resume", "checkpoint"):
+                daemon.request("POST", f"/v1/runs/{watched}:{action}")
+
+    with concurrent.futures.ThreadPoolExecutor(3) as pool:
+        list(pool.map(watch, range(3)))
+    assert daemon.run(watched)["state"] == "completed"
+    assert daemon.csv(watched) == daemon.csv(alone)
+    daemon.away(alone, watched)
+
+
+def test_status_answers_in_50_ms_while_big_steps_are_made(daemon):
+    runs = [daemon.create(big())["id"] for _ in range(2)]
+    for run in runs:
+        daemon.wait_step(run, 1)
+
+    def quick():
+        times = []
+        for _ in range(30):
+            start = time.monotonic()
+            assert daemon.run(runs[0])["state"] == "running"
+            times.append(time.monotonic() - start)
+        times.sort()
+        return times[len(times) * 9 // 10] < (0.5 if is_sanitized() else 0.05)
+
+    # The machine may be busy with something else; that it is so each time is unlikely.
+    assert any(quick() for _ in range(5))
+    daemon.away(*runs)
+
+
+def test_actions_take_effect_at_the_next_step_boundary(daemon):
+    run = daemon.create(big())["id"]
+    daemon.wait_step(run, 2)
+    start = time.monotonic()
+    before = daemon.run(run)["step"]
+    assert daemon.act(run, "pause")["effective_step"] >= before
+    assert time.monotonic() - start < 10
+    daemon.away(run)
+
+
+def test_many_creations_at_once_get_ids_of_their_own(daemon):
+    with concurrent.futures.ThreadPoolExecutor(8) as pool:
+        runs = list(pool.map(lambda _: daemon.create(water(time={"end": 0.002}))["id"], range(24)))
+    assert len(set(runs)) == 24
+    for run in runs:
+        daemon.wait(run, "completed")
+    with concurrent.futures.ThreadPoolExecutor(8) as pool:
+        list(pool.map(daemon.away, runs))
+    assert not set(runs) & {r["id"] for r in daemon.get("/v1/runs")["runs"]}
+
+
+def test_cancel_and_delete_while_others_read(daemon):
+    def life(_):
+        run = daemon.create(endless(), start=False)["id"]
+        daemon.act(run, "start")
+        daemon.act(run, "cancel")
+        daemon.ask("DELETE", f"/v1/runs/{run}", status=204)
+
+    def look(_):
+        for _ in range(15):
+            for run in daemon.get("/v1/runs")["runs"]:
+                for path in ("", "/frames", "/probes", "/scene", "/frames/latest"):
+                    assert daemon.request("GET", f"/v1/runs/{run['id']}{path}").status in (200, 404)
+
+    with concurrent.futures.ThreadPoolExecutor(8) as pool:
+        jobs = [pool.submit(life, k) for k in range(20)] + [pool.submit(look, k) for k in range(4)]
+        for job in jobs:
+            job.result()
+    assert daemon.get("/v1/runs")["runs"] == []
+
+
+def test_commands_to_a_run_that_is_stopped_are_all_answered(fresh):
+    d = fresh().start()
+    run = d.create(big())["id"]
+    d.wait_step(run, 1)
+    import signal
+
+    def ask(_):
+        try:
+            for _ in range(50):
+                d.request("POST", f"/v1/runs/{run}:checkpoint", check=False)
+        except OSError:
+            pass  # the daemon is gone
+        except Exception as error:  # a connection that ended within an answer
+            assert "http.client" in type(error).__module__, error
+
+    with concurrent.futures.ThreadPoolExecutor(4) as pool:
+        jobs = [pool.submit(ask, k) for k in range(4)]
+        time.sleep(0.2)
+        d.process.send_signal(signal.SIGTERM)
+        assert d.process.wait(60) == 0
+        for job in jobs:
+            job.result()
+    d.process = None
+
+
+@pytest.mark.long
+def test_thousand_runs_come_and_go(daemon):
+    def cycle(n):
+        for _ in range(n):
+            run = daemon.create(water(time={"end": 0.002}))["id"]
+            daemon.wait(run, "completed")
+            daemon.away(run)
+
+    cycle(50)
+    memory, descriptors, threads = daemon.memory(), daemon.descriptors(), daemon.n_threads()
+    with concurrent.futures.ThreadPoolExecutor(4) as pool:
+        list(pool.map(cycle, [250] * 4))
+    until(lambda: daemon.descriptors() <= descriptors + 4 and daemon.n_threads() <= threads + 4)
+    if not is_sanitized():
+        assert daemon.memory() < memory + 20e6

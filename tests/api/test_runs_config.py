@@ -1,0 +1,239 @@
+"""What may change while a run goes on."""
+import pytest
+from boxes import endless, water
+from fbard import fbar_is_on, until
+from frames import Frame
+
+
+@pytest.fixture(scope="module")
+def live(daemon):
+    run = daemon.create(endless())["id"]
+    daemon.wait_step(run, 1)
+    yield run
+    daemon.away(run)
+
+
+def test_config_shows_what_can_be_patched(daemon, live):
+    config = daemon.get(f"/v1/runs/{live}/config")
+    for key in ("fbar", "damping", "transfer", "time", "output", "gravity"):
+        assert key in config, key
+    assert config["time"]["end"] == 1e6
+    assert config["time"]["dt"] == 1e-3
+    for key in ("materials", "bodies", "walls", "cell", "basis"):
+        assert key not in config
+
+
+def test_fbar_toggles_in_mid_run(daemon, live):
+    for form in (True, False, {"scheme": "anchored", "a": 0.05, "C": 1}, {"scheme": "zhao"}, False):
+        before = daemon.run(live)["step"]
+        answer = daemon.patch(live, {"fbar": form})
+        assert answer["effective_step"] >= before
+        run = daemon.run(live)
+        assert run["state"] == "running"
+        assert run["step"] >= answer["effective_step"]
+        assert fbar_is_on(run) == bool(form)
+        config = daemon.get(f"/v1/runs/{live}/config")["fbar"]
+        assert bool(config) == bool(form)
+        if isinstance(form, dict) and form["scheme"] == "anchored":
+            assert (config["scheme"], config["a"], config["C"]) == ("anchored", 0.05, 1)
+        assert daemon.get(f"/v1/runs/{live}/scene")["fbar"] == config
+
+
+def test_patch_takes_both_content_types(daemon, live):
+    for kind in ("application/json", "application/merge-patch+json", "application/json; charset=utf-8",
+                 "Application/JSON"):  # fmt: skip
+        reply = daemon.ask("PATCH", f"/v1/runs/{live}/config", {"damping": {"mass": 0}}, {"Content-Type": kind})
+        assert "effective_step" in reply.json
+    for kind in ("text/plain", "application/xml", "application/x-www-form-urlencoded"):
+        daemon.ask("PATCH", f"/v1/runs/{live}/config", {"damping": {"mass": 1}}, {"Content-Type": kind}, status=415)
+    assert daemon.get(f"/v1/runs/{live}/config")["damping"]["mass"] == 0
+
+
+def test_damping_blend_gravity_and_output_are_settable(daemon, live):
+    patch = {"damping": {"local": 0.1, "mass": 2}, "transfer": {"blend": 0.9}, "gravity": [0, -0.001],
+             "output": {"interval": 2e5}}  # fmt: skip
+    daemon.patch(live, patch)
+    config = daemon.get(f"/v1/runs/{live}/config")
+    assert config["damping"] == {"local": 0.1, "mass": 2}
+    assert config["transfer"]["blend"] == 0.9
+    assert config["gravity"] == [0, -0.001]
+    assert config["output"]["interval"] == 2e5
+    daemon.patch(live, {"damping": {"local": 0, "mass": 0}, "transfer": {"blend": 1}, "gravity": [0, 0]})
+
+
+def test_dt_and_cfl_replace_each_other(daemon, live):
+    daemon.patch(live, {"time": {"cfl": 0.2, "dt": None}})
+    until(lambda: daemon.run(live)["dt"] == pytest.approx(0.2 * 0.25 / 10, rel=0.05))
+    config = daemon.get(f"/v1/runs/{live}/config")["time"]
+    assert config["cfl"] == 0.2
+    assert config.get("dt") is None
+    daemon.patch(live, {"time": {"dt": 2e-3, "cfl": None}})
+    until(lambda: daemon.run(live)["dt"] == 2e-3)
+    assert daemon.get(f"/v1/runs/{live}/config")["time"].get("cfl") is None
+    daemon.patch(live, {"time": {"dt": 1e-3}})
+
+
+def test_unstable_dt_is_refused_with_its_limit(daemon, live):
+    reply = daemon.ask("PATCH", f"/v1/runs/{live}/config", {"time": {"dt": 1.0}}, status=422)
+    fault = reply.fault("/time/dt")
+    assert any(c.isdigit() for c in fault["expected"])
+    assert "1" in fault["actual"]
+    assert daemon.get(f"/v1/runs/{live}/config")["time"]["dt"] == 1e-3
+    assert daemon.run(live)["state"] == "running"
+
+
+@pytest.mark.parametrize(
+    "patch, pointer",
+    [
+        ({"materials": {"bar": {"youngs_modulus": 1}}}, "/materials"),
+        ({"cell": 0.5}, "/cell"), ({"basis": "gimp"}, "/basis"), ({"dimension": 3}, "/dimension"),
+        ({"bodies": None}, "/bodies"), ({"walls": {"end": None}}, "/walls"), ({"domain": {}}, "/domain"),
+        ({"probes": {}}, "/probes"), ({"stages": []}, "/stages"),
+        ({"transfer": {"scheme": "apic"}}, "/transfer/scheme"),
+        ({"fbarr": True}, "/fbarr"), ({"fbar": "yes"}, "/fbar"), ({"fbar": 1}, "/fbar"),
+        ({"fbar": {"scheme": "hao"}}, "/fbar/scheme"),
+        ({"damping": {"local": -0.1}}, "/damping/local"), ({"damping": {"local": 1}}, "/damping/local"),
+        ({"damping": {"mass": "a"}}, "/damping/mass"), ({"damping": {"lokal": 0.1}}, "/damping/lokal"),
+        ({"transfer": {"blend": 1.01}}, "/transfer/blend"),
+        ({"gravity": [0]}, "/gravity"), ({"gravity": [0, "g"]}, "/gravity/1"), ({"gravity": [0, 0, 0]}, "/gravity"),
+        ({"time": {"dt": 0}}, "/time/dt"), ({"time": {"dt": -1e-3}}, "/time/dt"),
+        ({"time": {"cfl": 0, "dt": None}}, "/time/cfl"), ({"time": {"end": -1}}, "/time/end"),
+        ({"time": {"end": 1e-9}}, "/time/end"),
+        ({"output": {"fields": ["position", "colour"]}}, "/output/fields/1"),
+        ({"output": {"interval": 0}}, "/output/interval"),
+    ],
+)  # fmt: skip
+def test_what_may_not_change_is_422_with_its_pointer(daemon, live, patch, pointer):
+    before = daemon.get(f"/v1/runs/{live}/config")
+    reply = daemon.ask("PATCH", f"/v1/runs/{live}/config", patch, status=422)
+    assert any(p == pointer or p.startswith(pointer + "/") for p in reply.pointers), reply
+    assert daemon.get(f"/v1/runs/{live}/config") == before
+    assert daemon.run(live)["state"] == "running"
+
+
+def test_all_faults_of_a_patch_come_at_once_and_nothing_of_it_is_done(daemon, live):
+    before = daemon.get(f"/v1/runs/{live}/config")
+    patch = {"fbar": True, "cell": 1, "damping": {"local": 7, "mass": "x"}, "gravity": [1, 2, 3]}
+    reply = daemon.ask("PATCH", f"/v1/runs/{live}/config", patch, status=422)
+    assert {"/cell", "/damping/local", "/damping/mass", "/gravity"} <= set(reply.pointers)
+    assert daemon.get(f"/v1/runs/{live}/config") == before
+
+
+@pytest.mark.parametrize("body", [b"", b"{", b'{"fbar": true,}', b'{"fbar": true, "fbar": false}', b'{"fbar": nan}'])
+def test_patch_that_is_no_json_is_400(daemon, live, body):
+    daemon.ask("PATCH", f"/v1/runs/{live}/config", body, {"Content-Type": "application/json"}, status=400)
+
+
+@pytest.mark.parametrize("body", [[], 1, "fbar", None, True])
+def test_patch_that_is_no_object_is_422(daemon, live, body):
+    data = b"null" if body is None else body
+    headers = {"Content-Type": "application/json"}
+    assert "" in daemon.ask("PATCH", f"/v1/runs/{live}/config", data, headers, status=422).pointers
+
+
+def test_empty_patch_changes_nothing(daemon, live):
+    before = daemon.ask("GET", f"/v1/runs/{live}/config")
+    assert "effective_step" in daemon.patch(live, {})
+    after = daemon.ask("GET", f"/v1/runs/{live}/config")
+    assert after.json == before.json
+    assert after.headers["etag"] == before.headers["etag"]
+
+
+def test_etag_guards_against_a_lost_update(daemon, live):
+    path = f"/v1/runs/{live}/config"
+    first = daemon.ask("GET", path).headers["etag"]
+    assert first.startswith('"') and first.endswith('"')
+    assert daemon.ask("GET", path).headers["etag"] == first
+    reply = daemon.ask("PATCH", path, {"damping": {"mass": 3}}, {"If-Match": first})
+    second = daemon.ask("GET", path).headers["etag"]
+    assert second != first
+    assert reply.headers.get("etag", second) == second
+    daemon.ask("PATCH", path, {"damping": {"mass": 4}}, {"If-Match": first}, status=412)
+    assert daemon.get(path)["damping"]["mass"] == 3
+    daemon.ask("PATCH", path, {"damping": {"mass": 5}}, {"If-Match": "*"})
+    third = daemon.ask("GET", path).headers["etag"]
+    daemon.ask("PATCH", path, {"damping": {"mass": 0}}, {"If-Match": f"{first}, {third}"})
+    assert daemon.get(path)["damping"]["mass"] == 0
+    daemon.ask("PATCH", path, {"damping": {"mass": 1}}, {"If-Match": '"nonsense"'}, status=412)
+
+
+def test_end_can_be_moved_and_the_run_ends_there(daemon, name):
+    daemon.create(water(), id=name, start=False)
+    daemon.act(name, "step", {"steps": 20})
+    daemon.wait(name, "paused")
+    reply = daemon.ask("PATCH", f"/v1/runs/{name}/config", {"time": {"end": 0.01}}, status=422)
+    assert reply.pointers == ["/time/end"]
+    daemon.patch(name, {"time": {"end": 0.04}})
+    run = daemon.run(name)
+    assert run["end_time"] == 0.04
+    assert run["progress"] == pytest.approx(0.5, abs=0.01)
+    daemon.act(name, "resume")
+    run = daemon.wait(name, "completed")
+    assert run["step"] == 40
+    assert Frame(daemon.frame(name, "latest")).header["time"] == pytest.approx(0.04)
+    daemon.away(name)
+
+
+def test_patch_shows_in_the_frames_after_its_step(daemon, name):
+    daemon.create(water(output={"interval": 0.002}), id=name, start=False)
+    daemon.act(name, "step", {"steps": 30})
+    daemon.wait(name, "paused")
+    assert daemon.patch(name, {"fbar": False})["effective_step"] == 30
+    daemon.act(name, "step", {"steps": 30})
+    daemon.wait(name, "paused")
+    assert daemon.patch(name, {"fbar": {"scheme": "anchored", "a": 0.05, "C": 1}})["effective_step"] == 60
+    daemon.act(name, "resume")
+    daemon.wait(name, "completed")
+    for entry in daemon.frames(name):
+        header = Frame(daemon.frame(name, entry["seq"])).header
+        if header["step"] not in (30, 60):
+            assert header["fbar"] == (not 30 < header["step"] < 60), header["step"]
+    daemon.away(name)
+
+
+def test_patch_of_output_changes_the_frames_that_come(daemon, name):
+    daemon.create(water(), id=name, start=False)
+    daemon.act(name, "step", {"steps": 50})
+    daemon.wait(name, "paused")
+    daemon.patch(name, {"output": {"interval": 0.002, "fields": ["position", "density"]}})
+    daemon.act(name, "resume")
+    daemon.wait(name, "completed")
+    index = daemon.frames(name)
+    assert [f["step"] for f in index] == list(range(0, 51, 10)) + list(range(52, 101, 2))
+    assert list(Frame(daemon.frame(name, "latest")).fields) == ["position", "density"]
+    assert list(Frame(daemon.frame(name, 0)).fields) == ["position", "velocity", "mean_stress"]
+    daemon.away(name)
+
+
+def test_fields_that_were_not_kept_cannot_be_asked_for_later(daemon, name):
+    daemon.create(water(), id=name, start=False)
+    patch = {"output": {"fields": ["position", "velocity", "displacement"]}}
+    reply = daemon.request("PATCH", f"/v1/runs/{name}/config", patch)
+    assert reply.status in (200, 422), reply
+    daemon.act(name, "snapshot")
+    daemon.away(name)
+
+
+def test_patch_of_a_queued_run_holds_when_it_starts(daemon):
+    runs = [daemon.create(endless())["id"] for _ in range(2)]
+    third = daemon.create(water(), start=False)["id"]
+    daemon.act(third, "start")
+    if daemon.run(third)["state"] == "queued":
+        assert daemon.patch(third, {"fbar": False})["effective_step"] == 0
+    daemon.away(*runs)
+    assert not fbar_is_on(daemon.wait(third, "completed"))
+    daemon.away(third)
+
+
+def test_patch_of_a_finished_run_is_409(daemon, name):
+    daemon.create(water(time={"end": 0.005}), id=name)
+    daemon.wait(name, "completed")
+    reply = daemon.ask("PATCH", f"/v1/runs/{name}/config", {"fbar": False}, status=409)
+    assert "completed" in reply.json["detail"]
+    assert daemon.get(f"/v1/runs/{name}/config")["fbar"] is not False
+    daemon.away(name)
+
+
+def test_config_of_an_unknown_run_is_404(daemon):
+    daemon.ask("GET", "/v1/runs/nobody/config", status=404)
+    daemon.ask("PATCH", "/v1/runs/nobody/config", {"fbar": True}, status=404)

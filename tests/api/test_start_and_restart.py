@@ -1,0 +1,420 @@
+"""The command line, signals, and what survives them."""
+import http.client
+import json
+import os
+import re
+import shutil
+import signal
+import socket
+import ssl
+import stat
+import subprocess
+
+import pytest
+from boxes import endless, merged, water
+from fbard import PROGRAM, Daemon, fbar_is_on, is_sanitized, until
+from frames import Frame
+
+
+def launch(*options, **more):
+    """Runs a daemon that is not expected to stay."""
+    return subprocess.run([PROGRAM, *map(str, options)], capture_output=True, text=True, timeout=60, **more)
+
+
+def refused(*options, code=None, **more):
+    ended = launch(*options, **more)
+    assert ended.returncode > 0, ended
+    assert code is None or ended.returncode == code, ended
+    assert ended.stderr.strip(), "no message"
+    assert "Sanitizer" not in ended.stderr, ended.stderr
+    return ended.stderr
+
+
+FREE = ("--http", "127.0.0.1:0", "--publish", "tcp://127.0.0.1:0")
+
+
+# ---- Starting ----
+
+
+def test_help_and_version(tmp_path):
+    ended = launch("--help")
+    assert ended.returncode == 0
+    for option in ("--http", "--publish", "--data-dir", "--threads", "--slots", "--resume", "--token-file", "--tls-cert",
+                   "--tls-key", "--curve-dir", "--port-file", "--insecure"):  # fmt: skip
+        assert option in ended.stdout
+    ended = launch("--version")
+    assert ended.returncode == 0
+    assert re.search(r"\d+\.\d+", ended.stdout)
+    assert not ended.stderr
+
+
+@pytest.mark.parametrize(
+    "options",
+    [("--colour",), ("blue",), ("--http",), ("--http", "nonsense"), ("--http", "127.0.0.1:99999"),
+     ("--http", "127.0.0.1:-1"), ("--publish", "udp://x"), ("--threads", "0"), ("--threads", "many"), ("--slots", "-1"),
+     ("--resume", "maybe"), ("--tls-cert", "x"), ("--data-dir", "")],
+)  # fmt: skip
+def test_bad_options_exit_2(tmp_path, options):
+    refused("--data-dir", tmp_path / "data", *options, code=2)
+
+
+def test_port_file_has_both_addresses_and_they_answer(daemon):
+    ports = json.loads((daemon.folder / "ports.json").read_text())
+    assert set(ports) == {"http", "publish"}
+    assert re.fullmatch(r"http://127\.0\.0\.1:\d+", ports["http"])
+    assert re.fullmatch(r"tcp://127\.0\.0\.1:\d+", ports["publish"])
+    assert daemon.ask("GET", "/healthz").status == 200
+    assert daemon.ask("GET", "/readyz").status == 200
+    with socket.create_connection(("127.0.0.1", int(ports["publish"].rsplit(":", 1)[1])), timeout=20):
+        pass
+    assert [p.name for p in daemon.folder.iterdir() if p.name.startswith("ports")] == ["ports.json"]
+
+
+def test_version_resource_describes_the_daemon(daemon):
+    about = daemon.get("/v1")
+    assert re.search(r"\d+\.\d+", str(about["version"]))
+    text = json.dumps(about)
+    assert daemon.http in text and daemon.publish in text
+    assert "threads" in text and "limits" in about
+
+
+def test_busy_http_port_is_an_error_that_names_it(daemon, tmp_path):
+    message = refused("--http", daemon.host, "--publish", "tcp://127.0.0.1:0", "--data-dir", tmp_path / "d")
+    assert daemon.host.split(":")[1] in message
+
+
+def test_busy_publish_port_is_an_error_that_names_it(daemon, tmp_path):
+    message = refused("--http", "127.0.0.1:0", "--publish", daemon.publish, "--data-dir", tmp_path / "d")
+    assert daemon.publish.rsplit(":", 1)[1] in message
+
+
+def test_second_daemon_on_one_data_folder_is_refused(daemon):
+    message = refused(*FREE, "--data-dir", daemon.data)
+    assert str(daemon.data) in message
+    assert daemon.get("/healthz") is not None
+
+
+def test_data_folder_that_is_a_file_is_refused(tmp_path):
+    (tmp_path / "file").write_text("x")
+    assert "file" in refused(*FREE, "--data-dir", tmp_path / "file")
+    assert "file" in refused(*FREE, "--data-dir", tmp_path / "file" / "below")
+    assert (tmp_path / "file").read_text() == "x"
+
+
+def test_data_folder_without_write_permission_is_refused(tmp_path):
+    folder = tmp_path / "data"
+    folder.mkdir()
+    # root may write where the mode forbids it, but not below /proc
+    if os.geteuid() == 0:
+        folder = "/proc/fbard"
+    else:
+        folder.chmod(stat.S_IRUSR | stat.S_IXUSR)
+    assert str(folder) in refused(*FREE, "--data-dir", folder)
+
+
+def test_port_file_that_cannot_be_written_is_an_error(tmp_path):
+    where = tmp_path / "none" / "ports.json"
+    assert str(where) in refused(*FREE, "--data-dir", tmp_path / "d", "--port-file", where)
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "[::]", "192.0.2.1"])
+def test_addresses_beyond_loopback_need_protection(tmp_path, host):
+    common = ("--data-dir", tmp_path / "d")
+    assert "--insecure" in refused("--http", f"{host}:0", "--publish", "tcp://127.0.0.1:0", *common)
+    assert refused("--http", "127.0.0.1:0", "--publish", f"tcp://{host}:0", *common)
+
+
+def test_missing_or_empty_token_file_is_refused(tmp_path):
+    assert "none" in refused(*FREE, "--data-dir", tmp_path / "d", "--token-file", tmp_path / "none")
+    (tmp_path / "empty").write_text("")
+    (tmp_path / "empty").chmod(0o600)
+    refused(*FREE, "--data-dir", tmp_path / "d", "--token-file", tmp_path / "empty")
+
+
+def test_token_is_required_where_one_is_given(fresh, tmp_path):
+    token = tmp_path / "token"
+    token.write_text("correct-horse-battery\n")
+    token.chmod(0o600)
+    d = fresh("--token-file", str(token)).start()
+    for header in (None, "Bearer wrong", "Bearer ", "Bearer correct-horse-batter", "Bearer correct-horse-battery1",
+                   "Basic Y29ycmVjdC1ob3JzZQ==", "correct-horse-battery"):  # fmt: skip
+        headers = {"Authorization": header} if header else {}
+        for method, path, body in (("GET", "/v1/runs", None), ("POST", "/v1/runs", {"scene": water()}),
+                                   ("GET", "/v1/runs/x/frames/0", None)):  # fmt: skip
+            reply = d.ask(method, path, body, headers, status=401)
+            assert "bearer" in reply.headers["www-authenticate"].lower()
+    d.token = "correct-horse-battery"
+    assert d.get("/v1/runs") == {"runs": []}
+    run = d.create(water())["id"]
+    d.wait(run, "completed")
+    assert "correct-horse" not in d.stderr()
+
+
+@pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGINT])
+def test_signal_ends_it_with_exit_0(fresh, how):
+    d = fresh().start()
+    for _ in range(3):
+        d.create(endless())
+    d.create(endless(), start=False)
+    d.stop(how)
+    assert all("=" in line for line in d.stderr().splitlines() if line), "logs are key=value"
+
+
+def test_logs_stay_one_line_each_whatever_a_request_holds(fresh):
+    d = fresh().start()
+    run = d.create(water(title='a\nlevel=error event="forged"\x7f\u2028'), start=False)["id"]
+    d.request("GET", "/v1/runs/%0alevel=error")
+    d.away(run)
+    d.stop()
+    assert not [line for line in d.stderr().splitlines() if line.startswith("level=error") or "forged" in line[:30]]
+    assert all("=" in line for line in d.stderr().splitlines() if line)
+
+
+def test_tls_serves_https(tmp_path):
+    cert, key = tmp_path / "cert.pem", tmp_path / "key.pem"
+    if shutil.which("openssl") is None:
+        pytest.skip("no openssl to make a certificate with")
+    subprocess.run(["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "1", "-subj", "/CN=localhost",
+                    "-keyout", key, "-out", cert], check=True, capture_output=True)  # fmt: skip
+    assert refused(*FREE, "--data-dir", tmp_path / "x", "--tls-cert", tmp_path / "none", "--tls-key", key)
+    d = Daemon(tmp_path / "d", "--tls-cert", str(cert), "--tls-key", str(key)).start()
+    try:
+        assert d.http.startswith("https://127.0.0.1:")
+        context = ssl.create_default_context(cafile=str(cert))
+        context.check_hostname = False
+        connection = http.client.HTTPSConnection(d.host, timeout=60, context=context)
+        connection.request("GET", "/v1/runs")
+        answer = connection.getresponse()
+        assert (answer.status, json.loads(answer.read())) == (200, {"runs": []})
+        connection.close()
+    finally:
+        d.stop()
+
+
+def test_queue_that_is_full_is_503_and_not_ready(fresh):
+    d = fresh("--queue", "1", slots=1).start()
+    first, second = (d.create(endless())["id"] for _ in range(2))
+    d.ask("POST", "/v1/runs", {"scene": endless()}, status=503)
+    d.ask("GET", "/readyz", status=503)
+    d.ask("GET", "/healthz")
+    d.away(first)
+    d.ask("GET", "/readyz")
+    third = d.create(endless())["id"]
+    d.wait_step(second, 1)
+    d.away(second, third)
+
+
+# ---- Restarting ----
+
+
+def test_restart_lists_earlier_runs_with_frames_and_probes(fresh):
+    d = fresh().start()
+    done = d.create(water())["id"]
+    d.wait(done, "completed")
+    failed = d.create(merged(endless(), {"bodies": {"bar": {"velocity": [-50, 0]}}, "walls": {"end": None}}))["id"]
+    d.wait(failed, "failed")
+    cancelled = d.create(endless())["id"]
+    d.act(cancelled, "cancel")
+    paused = d.create(water(), start=False)["id"]
+    d.act(paused, "step", {"steps": 33})
+    d.wait(paused, "paused")
+    runs = (done, failed, cancelled, paused)
+
+    def everything():
+        return {r: (d.run(r), d.csv(r), d.get(f"/v1/runs/{r}/scene"), d.get(f"/v1/runs/{r}/config"),
+                    [d.frame(r, f["seq"]) for f in d.frames(r)]) for r in runs}  # fmt: skip
+
+    before = everything()
+    d.stop()
+    d.start()
+    after = everything()
+    for run in runs:
+        for was, now in zip(before[run][1:], after[run][1:]):
+            assert was == now
+        for key in ("id", "state", "step", "time", "end_time", "progress", "fbar", "particles", "scene", "created",
+                    "error", "balance", "probes", "accuracy"):  # fmt: skip
+            assert after[run][0][key] == before[run][0][key], (key, run)
+        assert after[run][0]["performance"]["wall_s"] == pytest.approx(before[run][0]["performance"]["wall_s"])
+    d.act(paused, "resume")
+    d.wait(paused, "completed")
+    assert d.csv(paused) == d.csv(done)
+    for run in runs:
+        d.ask("DELETE", f"/v1/runs/{run}", status=204)
+    d.stop()
+    d.start()
+    assert d.get("/v1/runs")["runs"] == []
+
+
+# 12,000 steps and 121 frames, long enough to be killed in the middle; sanitizers are that much slower
+LONG = water(time={"end": 4.5 if is_sanitized() else 12}, output={"interval": 0.1, "probe_interval": 0.01})
+
+
+def undisturbed(d, run):
+    """(frames, CSV) of a run once it is completed."""
+    d.wait(run, "completed")
+    return [d.frame(run, f["seq"]) for f in d.frames(run)], d.csv(run)
+
+
+@pytest.fixture(scope="module")
+def reference(daemon):
+    """LONG, with F-bar switched off at step 1000 and a changed end."""
+    run = daemon.create(LONG, id="survivor", start=False)["id"]
+    daemon.act(run, "step", {"steps": 1000})
+    daemon.wait(run, "paused")
+    daemon.patch(run, {"fbar": False})
+    daemon.act(run, "resume")
+    yield undisturbed(daemon, run)
+    daemon.away(run)
+
+
+def begin(d):
+    d.create(LONG, id="survivor", start=False)
+    d.act("survivor", "step", {"steps": 1000})
+    d.wait("survivor", "paused")
+    assert d.patch("survivor", {"fbar": False})["effective_step"] == 1000
+    d.act("survivor", "resume")
+
+
+def check_same(d, reference):
+    frames, text = undisturbed(d, "survivor")
+    assert len(frames) == len(reference[0])
+    for ours, theirs in zip(frames, reference[0]):
+        a, b = Frame(ours), Frame(theirs)
+        assert a.header == b.header
+        assert ours == theirs
+    assert text == reference[1]
+    assert not fbar_is_on(d.run("survivor"))
+
+
+@pytest.mark.parametrize("checkpoint", [False, True], ids=["from_the_start", "from_a_checkpoint"])
+def test_killed_run_continues_to_the_same_end(fresh, reference, checkpoint):
+    d = fresh().start()
+    begin(d)
+    d.wait_step("survivor", 1500)
+    if checkpoint:
+        d.act("survivor", "checkpoint")
+    d.wait_step("survivor", 2500)
+    before = [d.frame("survivor", f["seq"]) for f in d.frames("survivor")]
+    assert d.run("survivor")["state"] == "running", "too quick a machine: it is over"
+    d.kill()
+    d.start()
+    after = [d.frame("survivor", k) for k in range(len(before))]
+    assert after == before, "a frame once published never changes"
+    check_same(d, reference)
+
+
+def test_killed_again_and_again_it_still_comes_to_the_same_end(fresh, reference):
+    d = fresh().start()
+    begin(d)
+    for step in (1200, 2000, 2800, 3600):
+        d.wait_step("survivor", step)
+        d.kill()
+        d.start()
+    check_same(d, reference)
+
+
+def test_stopped_run_continues_to_the_same_end(fresh, reference):
+    d = fresh().start()
+    begin(d)
+    step = d.wait_step("survivor", 2000)["step"]
+    d.stop()
+    d.start()
+    run = d.run("survivor")
+    assert run["state"] in ("queued", "running")
+    assert run["step"] >= step, "it was checkpointed"
+    check_same(d, reference)
+
+
+def test_killed_right_after_201_the_run_is_there(fresh):
+    d = fresh().start()
+    runs = [d.create(water(), start=start)["id"] for start in (True, False)]
+    d.kill()
+    d.start()
+    assert {r["id"] for r in d.get("/v1/runs")["runs"]} == set(runs)
+    d.wait(runs[0], "completed")
+    assert d.run(runs[1])["state"] == "paused"
+    d.act(runs[1], "resume")
+    d.wait(runs[1], "completed")
+    assert d.csv(runs[0]) == d.csv(runs[1])
+
+
+def test_resume_paused_and_off_leave_runs_paused(fresh):
+    d = fresh("--resume", "paused").start()
+    run = d.create(endless())["id"]
+    d.wait_step(run, 100)
+    d.stop()
+    d.start()
+    now = d.run(run)
+    assert now["state"] == "paused" and now["step"] >= 100
+    d.act(run, "resume")
+    d.wait_step(run, now["step"] + 10)
+    d.stop()
+    d.options = ("--resume", "off")
+    d.start()
+    assert d.run(run)["state"] == "paused"
+    d.away(run)
+
+
+def test_pause_survives_a_kill(fresh):
+    d = fresh().start()
+    run = d.create(endless())["id"]
+    d.wait_step(run, 100)
+    step = d.act(run, "pause")["effective_step"]
+    d.kill()
+    d.start()
+    assert (d.run(run)["state"], d.run(run)["step"]) == ("paused", step)
+    d.act(run, "step", {"steps": 5})
+    assert d.wait(run, "paused")["step"] == step + 5
+    d.away(run)
+
+
+def test_interrupted_step_still_ends_where_it_was_to(fresh):
+    d = fresh().start()
+    run = d.create(endless(), start=False)["id"]
+    d.act(run, "step", {"steps": 30_000})
+    d.wait_step(run, 100)
+    d.kill()
+    d.start()
+    assert d.wait(run, "paused")["step"] == 30_000
+    d.away(run)
+
+
+def test_a_damaged_run_does_not_keep_the_daemon_from_starting(fresh):
+    d = fresh().start()
+    good, bad, worse = (d.create(water(), id=i)["id"] for i in ("good", "bad", "worse"))
+    for run in (good, bad, worse):
+        d.wait(run, "completed")
+    d.stop()
+    for path in d.data.rglob("*"):
+        if path.is_file() and "/bad/" in str(path):
+            path.write_bytes(b"\xff\0garbage" * 10)
+        elif path.is_file() and "/worse/" in str(path):
+            path.write_bytes(b"")
+    (d.data / "runs" / "empty").mkdir()
+    (d.data / "runs" / "stray").write_text("not a folder")
+    d.start()
+    assert d.run(good)["state"] == "completed"
+    assert len(d.frames(good)) == 11
+    for run in (bad, worse):
+        reply = d.request("GET", f"/v1/runs/{run}")
+        assert reply.status in (200, 404)
+        if reply.status == 200:
+            assert reply.json["state"] == "failed" and reply.json["error"]["kind"]
+            d.ask("DELETE", f"/v1/runs/{run}", status=204)
+    again = d.create(water())["id"]
+    d.wait(again, "completed")
+
+
+def test_torn_tails_are_cut(fresh, reference):
+    d = fresh().start()
+    begin(d)
+    d.wait_step("survivor", 2000)
+    d.kill()
+    folder = d.data / "runs" / "survivor"
+    for path in folder.rglob("*"):
+        if path.is_file() and (path.suffix in (".jsonl", ".log") or "frame" in path.name):
+            with open(path, "ab") as f:
+                f.write(b'{"event": "sta')
+    d.start()
+    until(lambda: d.run("survivor")["state"] in ("running", "queued", "completed", "failed"))
+    check_same(d, reference)

@@ -1,0 +1,455 @@
+// Probes on states whose values are known, moving means, and the balance of conserved quantities.
+#include <fenv.h>
+#include <math.h>
+#include <setjmp.h>
+#include <stdarg.h>
+#include <stddef.h>
+#include <stdint.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include <cmocka.h>
+
+#include "server/mpm/sim.h"
+
+static void near_at(double a, double b, double tol, int line) {
+    if (!(fabs(a - b) <= tol)) {
+        print_error("%.17g is not within %g of %.17g\n", a, tol, b);
+        _fail(__FILE__, line);
+    }
+}
+#define assert_near(a, b, tol) near_at(a, b, tol, __LINE__)
+
+#define DT 1e-3
+
+// Two blocks of 4 x 4 cells of 1/8 m, 2 x 2 (x 2) particles each: x from 0 to 0.5 and from 1
+// to 1.5.
+static struct {
+    struct mpm_def def;
+    struct mpm_material_def materials[2];
+    struct mpm_body_def bodies[2];
+    struct mpm_stage_def stages[2];
+    struct mpm_wall_def wall;
+    struct mpm_probe_def probes[16];
+} world;
+
+static void define(int dim) {
+    memset(&world, 0, sizeof world);
+    world.def = mpm_def_default();
+    world.materials[0] = (struct mpm_material_def){.name = "rubber",
+                                                   .model = mpm_material_find("neo_hookean"),
+                                                   .parameters = {1000, 1e4, 0.3}};
+    world.materials[1] = (struct mpm_material_def){
+        .name = "water", .model = mpm_material_find("newtonian"), .parameters = {500, 1e4, 0}};
+    for (int b = 0; b < 2; b++) {
+        world.bodies[b] = (struct mpm_body_def){.name = b ? "right" : "left",
+                                                .material = b,
+                                                .particles_per_direction = 2,
+                                                .shape = {.min = {b}, .max = {b + 0.5, 0.5, 0.5}}};
+    }
+    for (int d = 0; d < 3; d++) {
+        world.def.domain_min[d] = -1;
+        world.def.domain_max[d] = 3;
+    }
+    world.stages[0] = (struct mpm_stage_def){.name = "main", .duration = 10};
+    world.def.dimension = dim;
+    world.def.cell = 0.125;
+    world.def.settings.dt = DT;
+    world.def.n_materials = world.def.n_bodies = 2;
+    world.def.n_stages = 1;
+    world.def.materials = world.materials;
+    world.def.bodies = world.bodies;
+    world.def.stages = world.stages;
+    world.def.walls = &world.wall;
+    world.def.probes = world.probes;
+}
+
+static struct mpm_probe_def *add_probe(enum mpm_probe_kind kind, int body) {
+    struct mpm_probe_def *q = &world.probes[world.def.n_probes++];
+    *q = (struct mpm_probe_def){
+        .name = "probe", .kind = kind, .body = body, .scale = 1, .quantile = 1};
+    return q;
+}
+
+static struct mpm_sim *create(void) {
+    struct mpm_sim *sim;
+    struct mpm_error err = {0};
+    if (mpm_create(&world.def, &sim, &err)) {
+        fail_msg("%s: %s", err.pointer, err.message);
+    }
+    return sim;
+}
+
+static void step(struct mpm_sim *sim) {
+    struct mpm_error err = {0};
+    if (mpm_step(sim, &err)) {
+        fail_msg("%s", err.message);
+    }
+}
+
+static double value(struct mpm_sim *sim, size_t probe) {
+    double out[MPM_MAX_COMPONENTS];
+    mpm_probe_value(sim, probe, out);
+    return out[0];
+}
+
+static void test_probe_extent_is_the_outermost_particle(void **state) {
+    (void)state;
+    define(2);
+    for (int body = -1; body < 2; body++) {
+        for (int side = 0; side < 2; side++) {
+            add_probe(MPM_PROBE_EXTENT, body)->max_side = side;
+        }
+    }
+    add_probe(MPM_PROBE_EXTENT, 1)->axis = 1;
+    add_probe(MPM_PROBE_EXTENT, 1)->scale = -10;
+    struct mpm_sim *sim = create();
+    const double expected[] = {1.0 / 32,     1.5 - 1.0 / 32, 1.0 / 32, 0.5 - 1.0 / 32,
+                               1 + 1.0 / 32, 1.5 - 1.0 / 32, 1.0 / 32, -10 * (1 + 1.0 / 32)};
+    for (size_t k = 0; k < 8; k++) {
+        assert_int_equal(mpm_probe_components(sim, k), 1);
+        assert_string_equal(mpm_probe_component_name(sim, k, 0), "");
+        assert_near(value(sim, k), expected[k], 1e-15);
+    }
+    mpm_free(sim);
+}
+
+// The p-quantile of n values is the smallest value that at least p n of them do not exceed; from
+// the low side, the mirror image.
+static void test_probe_extent_takes_a_quantile(void **state) {
+    (void)state;
+    define(2);
+    const double p[] = {1e-9, 0.1, 0.25, 0.5, 0.7, 0.9, 0.999, 1};
+    for (int k = 0; k < 8; k++) {
+        for (int side = 0; side < 2; side++) {
+            struct mpm_probe_def *q = add_probe(MPM_PROBE_EXTENT, 0);
+            q->quantile = p[k];
+            q->max_side = side;
+        }
+    }
+    struct mpm_sim *sim = create();
+    const size_t n = sim->sets[0].n;
+    for (int shuffle = 0; shuffle < 20; shuffle++) {
+        // Values 1 .. n in some order, with some of them equal in later rounds.
+        const size_t stride[] = {1, 3, 7, 27, 63};
+        for (size_t i = 0; i < n; i++) {
+            const size_t rank = (i * stride[shuffle % 5] + (size_t)shuffle) % n;
+            sim->sets[0].x[mpm_at(i, 2, 0)] =
+                (double)(shuffle < 10 ? rank + 1 : rank / 4 * 4 + 1) / (double)n;
+        }
+        for (size_t k = 0; k < 16; k++) {
+            const double wanted = p[k / 2] * (double)n;
+            double best = k % 2 ? INFINITY : -INFINITY;
+            for (size_t i = 0; i < n; i++) {
+                const double x = sim->sets[0].x[mpm_at(i, 2, 0)];
+                size_t reached = 0;
+                for (size_t j = 0; j < n; j++) {
+                    const double y = sim->sets[0].x[mpm_at(j, 2, 0)];
+                    reached += k % 2 ? y <= x : y >= x;
+                }
+                if ((double)reached >= wanted) {
+                    best = k % 2 ? fmin(best, x) : fmax(best, x);
+                }
+            }
+            assert_near(value(sim, k), best, 0);
+        }
+    }
+    mpm_free(sim);
+}
+
+// A displacement follows the particle that was nearest to the point; with a box, the mean over the
+// particles that were in it.
+static void test_probe_displacement_follows_its_particle(void **state) {
+    (void)state;
+    for (int dim = 2; dim <= 3; dim++) {
+        define(dim);
+        struct mpm_probe_def *q = add_probe(MPM_PROBE_DISPLACEMENT, -1);
+        q->at[0] = 1.4, q->at[1] = 0.2, q->at[2] = 0.2;
+        q = add_probe(MPM_PROBE_DISPLACEMENT, 0); // the same point, but of the other body
+        q->at[0] = 1.4, q->at[1] = 0.2, q->at[2] = 0.2;
+        q = add_probe(MPM_PROBE_DISPLACEMENT, 0);
+        q->has_box = true;
+        q->box_max[0] = 0.125, q->box_max[1] = q->box_max[2] = 1;
+        world.bodies[0].velocity = (struct mpm_velocity){.vector = {0, -0.5, 0.25}};
+        world.bodies[1].velocity = (struct mpm_velocity){.vector = {1, 0.25, 0}};
+        struct mpm_sim *sim = create();
+        for (int k = 0; k < 100; k++) {
+            step(sim);
+        }
+        double u[3][MPM_MAX_COMPONENTS];
+        for (size_t k = 0; k < 3; k++) {
+            assert_int_equal(mpm_probe_components(sim, k), dim);
+            mpm_probe_value(sim, k, u[k]);
+        }
+        for (int d = 0; d < dim; d++) { // round-off of 100 steps
+            assert_near(u[0][d], 0.1 * world.bodies[1].velocity.vector[d], 1e-13);
+            assert_near(u[1][d], 0.1 * world.bodies[0].velocity.vector[d], 1e-13);
+            assert_near(u[2][d], 0.1 * world.bodies[0].velocity.vector[d], 1e-13);
+        }
+        assert_string_equal(mpm_probe_component_name(sim, 0, 1), "y");
+        mpm_free(sim);
+    }
+}
+
+static void test_probe_folds_a_field(void **state) {
+    (void)state;
+    for (int dim = 2; dim <= 3; dim++) {
+        define(dim);
+        const enum mpm_probe_kind kinds[] = {MPM_PROBE_MAXIMUM, MPM_PROBE_MINIMUM, MPM_PROBE_MEAN,
+                                             MPM_PROBE_FIELD};
+        for (int k = 0; k < 4; k++) {
+            struct mpm_probe_def *q = add_probe(kinds[k], 1);
+            q->field = MPM_FIELD_MEAN_STRESS;
+            q->at[0] = 1 + 1.0 / 32;
+            q = add_probe(kinds[k], k == 3 ? 0 : -1);
+            q->field = MPM_FIELD_STRESS;
+            q->scale = 1e-3;
+        }
+        struct mpm_probe_def *q = add_probe(MPM_PROBE_MEAN, -1); // over none
+        q->field = MPM_FIELD_VELOCITY;
+        q->has_box = true;
+        q->box_min[0] = 2, q->box_max[0] = 3;
+        q = add_probe(MPM_PROBE_MAXIMUM, -1); // of the left body's left column of cells
+        q->field = MPM_FIELD_POSITION;
+        q->has_box = true;
+        q->box_max[0] = 0.125, q->box_max[1] = q->box_max[2] = 9;
+        struct mpm_sim *sim = create();
+        const int n = MPM_SYM(dim);
+        for (size_t b = 0; b < 2; b++) {
+            struct mpm_particles *s = &sim->sets[b];
+            for (size_t p = 0; p < s->n; p++) {
+                for (int k = 0; k < n; k++) { // 0 .. n - 1 times a factor of the body's
+                    s->sigma[mpm_at(p, n, k)] = (b ? 3 : -1) * (double)p * (k < 3 ? 1 : k);
+                }
+            }
+        }
+        const double last = (double)sim->sets[0].n - 1;
+        assert_near(value(sim, 0), 3 * last, 1e-10);
+        assert_near(value(sim, 2), 0, 0);
+        assert_near(value(sim, 4), 3 * last / 2, 1e-10);
+        assert_near(value(sim, 6), 0, 0); // the field at particle 0
+        double t[MPM_MAX_COMPONENTS];
+        assert_int_equal(mpm_probe_components(sim, 1), dim * dim);
+        mpm_probe_value(sim, 1, t);
+        assert_near(t[0], 3e-3 * last, 1e-12);
+        assert_near(t[1], 3e-3 * 3 * last, 1e-12); // xy
+        assert_near(t[dim], t[1], 0);              // yx
+        mpm_probe_value(sim, 3, t);
+        assert_near(t[0], -1e-3 * last, 1e-12);
+        mpm_probe_value(sim, 5, t);
+        assert_near(t[0], 1e-3 * last / 2, 1e-12);
+        assert_string_equal(mpm_probe_component_name(sim, 1, 1), "xy");
+        assert_string_equal(mpm_probe_component_name(sim, 1, (size_t)(dim * dim - 1)),
+                            dim == 2 ? "yy" : "zz");
+        mpm_probe_value(sim, 8, t);
+        assert_true(isnan(t[0]) && isnan(t[1]));
+        mpm_probe_value(sim, 9, t);
+        assert_near(t[0], 3.0 / 32, 1e-15);
+        assert_near(t[1], 0.5 - 1.0 / 32, 1e-15);
+        mpm_free(sim);
+    }
+}
+
+static void test_probe_energy_and_momentum_are_the_balance(void **state) {
+    (void)state;
+    for (int dim = 2; dim <= 3; dim++) {
+        define(dim);
+        add_probe(MPM_PROBE_ENERGY, -1);
+        add_probe(MPM_PROBE_MOMENTUM, -1);
+        world.bodies[0].velocity = (struct mpm_velocity){.vector = {2, 1, 3}};
+        world.def.settings.gravity[1] = -10;
+        struct mpm_sim *sim = create();
+        const double V = pow(0.5, dim), v2 = dim == 2 ? 5 : 14;
+        sim->sets[1].Jbar[0] = 1.1; // 1/2 K 0.1^2 of one particle
+        double e[4], mv[3];
+        assert_int_equal(mpm_probe_components(sim, 0), 4);
+        mpm_probe_value(sim, 0, e);
+        assert_near(e[0], 0.5 * 1000 * V * v2, 1e-10);
+        assert_near(e[1], 0.5 * 1e4 * 0.01 * pow(1.0 / 16, dim), 1e-12);
+        assert_near(e[2], (1000 + 500) * V * 10 * 0.25, 1e-10); // centres at half the height
+        assert_near(e[3], e[0] + e[1] + e[2], 1e-10);
+        const char *names[] = {"kinetic", "strain", "potential", "total"};
+        for (size_t k = 0; k < 4; k++) {
+            assert_string_equal(mpm_probe_component_name(sim, 0, k), names[k]);
+        }
+        mpm_probe_value(sim, 1, mv);
+        for (int d = 0; d < dim; d++) {
+            assert_near(mv[d], 1000 * V * world.bodies[0].velocity.vector[d], 1e-10);
+        }
+        struct mpm_balance balance;
+        mpm_balance(sim, &balance);
+        assert_near(balance.mass, 1500 * V, 1e-10);
+        // x v_y - y v_x about the origin, of a uniform velocity: that of the centre.
+        assert_near(balance.angular_momentum[2], 1000 * V * (0.25 * 1 - 0.25 * 2), 1e-10);
+        if (dim == 3) {
+            assert_near(balance.angular_momentum[0], 1000 * V * (0.25 * 3 - 0.25 * 1), 1e-10);
+            assert_near(balance.angular_momentum[1], 1000 * V * (0.25 * 2 - 0.25 * 3), 1e-10);
+        }
+        assert_near(balance.external_work, 0, 0);
+        mpm_free(sim);
+    }
+}
+
+// Gravity's work on a falling body is what it loses in potential and gains in kinetic energy.
+static void test_balance_of_work_in_free_fall(void **state) {
+    (void)state;
+    define(2);
+    world.def.settings.gravity[1] = -10;
+    struct mpm_sim *sim = create();
+    struct mpm_balance first, last;
+    mpm_balance(sim, &first);
+    for (int k = 0; k < 200; k++) {
+        step(sim);
+    }
+    mpm_balance(sim, &last);
+    assert_near(last.external_work, first.potential_energy - last.potential_energy, 1e-9);
+    // The symplectic step falls g dt t/2 further than the parabola: 1/2 g t^2 (1 + dt/t).
+    assert_near(last.kinetic_energy, last.external_work / (1 + DT / 0.2), 1e-9);
+    mpm_free(sim);
+}
+
+static void test_probe_drift_is_of_its_body(void **state) {
+    (void)state;
+    define(2);
+    add_probe(MPM_PROBE_DRIFT, -1);
+    add_probe(MPM_PROBE_DRIFT, 0);
+    add_probe(MPM_PROBE_DRIFT, 1);
+    struct mpm_sim *sim = create();
+    sim->sets[0].V[3] *= 2;
+    assert_non_null(sim->sets[1].J_raw); // what a fluid's drift is measured with
+    sim->sets[1].J_raw[4] = 0.25;
+    assert_near(value(sim, 0), log(4), 1e-15);
+    assert_near(value(sim, 1), log(2), 1e-15);
+    assert_near(value(sim, 2), log(4), 1e-15);
+    mpm_free(sim);
+}
+
+// A quantity that grows linearly: v_x = 5 t under gravity. Its mean over the last w seconds is
+// 5 (t - w/2); the sum of right-hand values adds 5 dt/2. Before a whole window: the mean so far.
+static void test_probe_average_of_a_linear_quantity(void **state) {
+    (void)state;
+    const double windows[] = {0.05, 0.013, 0.002, 0.25};
+    for (int w = 0; w < 4; w++) {
+        define(2);
+        world.def.settings.gravity[0] = 5;
+        struct mpm_probe_def *q = add_probe(MPM_PROBE_MEAN, 0);
+        q->field = MPM_FIELD_VELOCITY;
+        q->average = windows[w];
+        q->scale = 2;
+        struct mpm_sim *sim = create();
+        assert_near(value(sim, 0), 0, 0); // nothing to average yet: the present value
+        for (int k = 1; k <= 400; k++) {
+            step(sim);
+            const double t = k * DT, length = fmin(t, windows[w]);
+            // The window's start may lie between two of the points kept, w/63 or dt apart: the
+            // interpolated integral is off by the second derivative 5 times their distance^2/8.
+            const double apart = fmax(DT, windows[w] / 63 + DT);
+            assert_near(value(sim, 0), 2 * 5 * (t - length / 2 + DT / 2),
+                        2 * 5 * apart * apart / 8 / length + 1e-10);
+        }
+        mpm_free(sim);
+    }
+}
+
+// A stage that ends early makes the clock jump; a mean of a constant must not notice.
+static void test_probe_average_survives_a_jump_of_the_clock(void **state) {
+    (void)state;
+    define(2);
+    world.def.n_stages = 2;
+    world.stages[0] = (struct mpm_stage_def){
+        .name = "settle", .duration = 5, .kinetic_energy_ratio = 0.5, .states = MPM_SET_DAMPING};
+    world.stages[0].settings.damping_mass = 10;
+    world.stages[1] = (struct mpm_stage_def){.name = "main", .duration = 1};
+    world.bodies[0].velocity = (struct mpm_velocity){.vector = {0.1, 0}};
+    struct mpm_probe_def *q = add_probe(MPM_PROBE_MEAN, 1);
+    q->field = MPM_FIELD_DENSITY; // 500 in the body at rest
+    q->average = 0.02;
+    struct mpm_sim *sim = create();
+    while (mpm_step_count(sim) < 200) {
+        step(sim);
+        assert_near(value(sim, 0), 500, 1e-8);
+    }
+    assert_int_equal(mpm_stage(sim), 1);
+    mpm_free(sim);
+}
+
+static void test_fields_describe_themselves(void **state) {
+    (void)state;
+    define(3);
+    struct mpm_sim *sim = create();
+    for (int f = 0; f < MPM_N_FIELDS; f++) {
+        const struct mpm_field_info *info = mpm_field_info((enum mpm_field)f);
+        assert_int_equal(mpm_field_parse(info->name), f);
+        assert_true(strlen(info->unit) > 0 && strlen(info->doc) > 0);
+        const size_t width = mpm_field_components((enum mpm_field)f, 3);
+        assert_int_equal(width, info->shape == MPM_SCALAR ? 1 : info->shape == MPM_VECTOR ? 3 : 9);
+        assert_true(width <= MPM_MAX_COMPONENTS);
+    }
+    assert_int_equal(mpm_field_parse("charm"), -1);
+    assert_false(mpm_field_present(sim, MPM_FIELD_DISPLACEMENT)); // nobody asked
+    assert_false(mpm_field_present(sim, MPM_FIELD_PLASTIC_STRAIN));
+    mpm_free(sim);
+    world.def.wants_displacement = true;
+    sim = create();
+    assert_true(mpm_field_present(sim, MPM_FIELD_DISPLACEMENT));
+    mpm_free(sim);
+}
+
+// Values of derived fields, from a stress whose invariants are known; ids and bodies in order.
+static void test_fields_have_their_values(void **state) {
+    (void)state;
+    for (int dim = 2; dim <= 3; dim++) {
+        define(dim);
+        struct mpm_sim *sim = create();
+        const size_t n = mpm_n_particles(sim), half = n / 2;
+        struct mpm_particles *s = &sim->sets[1];
+        for (size_t p = 0; p < s->n; p++) {
+            const double sigma[] = {7, 1, 1, 2, 0, 0}; // deviator 4, -2, -2, shear 2
+            for (int k = 0; k < MPM_SYM(dim); k++) {
+                s->sigma[mpm_at(p, MPM_SYM(dim), k)] = sigma[k];
+            }
+            s->V[p] = 0.8 * s->V0[p];
+        }
+        double *out = calloc(n * 9, sizeof *out);
+        mpm_field_copy(sim, MPM_FIELD_MEAN_STRESS, out);
+        assert_near(out[0], 0, 0), assert_near(out[n - 1], 3, 1e-15);
+        mpm_field_copy(sim, MPM_FIELD_VON_MISES, out);
+        assert_near(out[n - 1], sqrt(1.5 * (16 + 4 + 4 + 2 * 4)), 1e-14);
+        mpm_field_copy(sim, MPM_FIELD_VOLUME_RATIO, out);
+        assert_near(out[0], 1, 0), assert_near(out[n - 1], 0.8, 1e-15);
+        mpm_field_copy(sim, MPM_FIELD_VOLUME_RATIO_BAR, out);
+        assert_near(out[n - 1], 1, 0);
+        mpm_field_copy(sim, MPM_FIELD_DENSITY, out);
+        assert_near(out[0], 1000, 0), assert_near(out[n - 1], 500 / 0.8, 1e-12);
+        mpm_field_copy(sim, MPM_FIELD_STRESS, out);
+        assert_near(out[(n - 1) * (size_t)(dim * dim) + 1], 2, 0);
+        uint32_t *id = (uint32_t *)out;
+        mpm_field_copy(sim, MPM_FIELD_ID, id);
+        for (size_t p = 0; p < n; p++) {
+            assert_int_equal(id[p], p);
+        }
+        mpm_field_copy(sim, MPM_FIELD_BODY, id);
+        assert_int_equal(id[half - 1], 0), assert_int_equal(id[half], 1);
+        free(out);
+        mpm_free(sim);
+    }
+}
+
+int main(int argc, char **argv) {
+    feenableexcept(FE_DIVBYZERO | FE_INVALID | FE_OVERFLOW);
+    const struct CMUnitTest tests[] = {
+        cmocka_unit_test(test_probe_extent_is_the_outermost_particle),
+        cmocka_unit_test(test_probe_extent_takes_a_quantile),
+        cmocka_unit_test(test_probe_displacement_follows_its_particle),
+        cmocka_unit_test(test_probe_folds_a_field),
+        cmocka_unit_test(test_probe_energy_and_momentum_are_the_balance),
+        cmocka_unit_test(test_balance_of_work_in_free_fall),
+        cmocka_unit_test(test_probe_drift_is_of_its_body),
+        cmocka_unit_test(test_probe_average_of_a_linear_quantity),
+        cmocka_unit_test(test_probe_average_survives_a_jump_of_the_clock),
+        cmocka_unit_test(test_fields_describe_themselves),
+        cmocka_unit_test(test_fields_have_their_values),
+    };
+    cmocka_set_test_filter(argc > 1 ? argv[1] : NULL);
+    return cmocka_run_group_tests(tests, NULL, NULL);
+}

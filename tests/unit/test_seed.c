@@ -1,0 +1,336 @@
+// Filling shapes: exact counts and places, whatever the domain's corner and the unit of length.
+#include <fenv.h>
+#include <math.h>
+#include <setjmp.h>
+#include <stdarg.h>
+#include <stddef.h>
+#include <stdint.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include <cmocka.h>
+
+#include "server/mpm/seed.h"
+
+static void near_at(double a, double b, double tol, int line) {
+    if (!(fabs(a - b) <= tol)) {
+        print_error("%.17g is not within %g of %.17g\n", a, tol, b);
+        _fail(__FILE__, line);
+    }
+}
+#define assert_near(a, b, tol) near_at(a, b, tol, __LINE__)
+
+// A domain of 10 cells a side with its corner at `corner`, lengths times `scale`.
+static struct mpm_def domain(int dim, double h, const double *corner) {
+    struct mpm_def def = mpm_def_default();
+    def.dimension = dim;
+    def.cell = h;
+    for (int d = 0; d < dim; d++) {
+        def.domain_min[d] = corner[d];
+        def.domain_max[d] = corner[d] + 10 * h;
+    }
+    return def;
+}
+
+static const double zero[3] = {0};
+
+static struct mpm_shape box(double x0, double y0, double x1, double y1) {
+    return (struct mpm_shape){.kind = MPM_SHAPE_BOX, .min = {x0, y0}, .max = {x1, y1}};
+}
+
+static size_t count(const struct mpm_def *def, const struct mpm_shape *shape, int n, bool closed) {
+    const struct mpm_body_def body = {
+        .shape = *shape, .particles_per_direction = n, .closed = closed};
+    const size_t found = mpm_seed(def, &body, NULL, NULL);
+    assert_true((double)found <= mpm_seed_bound(def, &body)); // memory is planned with it
+    return found;
+}
+
+static void test_seed_fills_whole_cells(void **state) {
+    (void)state;
+    for (int n = 1; n <= 6; n++) {
+        const struct mpm_def flat = domain(2, 0.1, zero), solid = domain(3, 0.1, zero);
+        // Edges at multiples of 0.1, which are not exact in binary.
+        const struct mpm_shape a = box(0.1, 0.3, 0.7, 0.5);
+        assert_int_equal(count(&flat, &a, n, false), 6 * 2 * n * n);
+        assert_int_equal(count(&flat, &a, n, true), 6 * 2 * n * n);
+        const struct mpm_shape b = {
+            .kind = MPM_SHAPE_BOX, .min = {0.1, 0.3, 0.2}, .max = {0.7, 0.5, 0.3}};
+        assert_int_equal(count(&solid, &b, n, false), 6 * 2 * n * n * n);
+    }
+}
+
+// Edges through lattice points: `closed` takes the points on them, open does not.
+static void test_seed_edges_are_open_or_closed(void **state) {
+    (void)state;
+    const struct mpm_def def = domain(2, 0.2, zero);
+    const struct mpm_shape a = box(0.25, 0.25, 0.65, 0.45); // points at 0.05 + 0.1 k
+    assert_int_equal(count(&def, &a, 2, false), 3 * 1);
+    assert_int_equal(count(&def, &a, 2, true), 5 * 3);
+    // One round-off to either side changes nothing.
+    const struct mpm_shape b =
+        box(nextafter(0.25, 0), nextafter(0.25, 1), nextafter(0.65, 1), nextafter(0.45, 0));
+    assert_int_equal(count(&def, &b, 2, false), 3 * 1);
+    assert_int_equal(count(&def, &b, 2, true), 5 * 3);
+}
+
+static void test_seed_combines_shapes(void **state) {
+    (void)state;
+    const struct mpm_def def = domain(2, 1, zero);
+    const struct mpm_shape parts[] = {box(1, 1, 5, 5), box(3, 3, 7, 7)};
+    struct mpm_shape both = {.kind = MPM_SHAPE_UNION, .n_children = 2, .children = parts};
+    assert_int_equal(count(&def, &both, 2, false), 4 * (16 + 16 - 4)); // the overlap once
+    both.kind = MPM_SHAPE_INTERSECTION;
+    assert_int_equal(count(&def, &both, 2, false), 4 * 4);
+    both.kind = MPM_SHAPE_DIFFERENCE;
+    assert_int_equal(count(&def, &both, 2, false), 4 * (16 - 4));
+
+    // A seam through lattice points: an open union leaves them out, a closed one has them once; a
+    // closed difference keeps the cut's edge, so that the two parts of a cut make up the whole.
+    const struct mpm_shape halves[] = {box(0, 0, 2.25, 4), box(2.25, 0, 4, 4)};
+    both = (struct mpm_shape){.kind = MPM_SHAPE_UNION, .n_children = 2, .children = halves};
+    assert_int_equal(count(&def, &both, 2, true), 64);
+    assert_int_equal(count(&def, &both, 2, false), 64 - 8);
+    const struct mpm_shape cut[] = {box(0, 0, 4, 4), box(2.25, 0, 9, 9)};
+    both = (struct mpm_shape){.kind = MPM_SHAPE_DIFFERENCE, .n_children = 2, .children = cut};
+    assert_int_equal(count(&def, &both, 2, true), 5 * 8);
+    assert_int_equal(count(&def, &both, 2, false), 4 * 8);
+
+    // A union inside a difference.
+    const struct mpm_shape holes[] = {box(1, 1, 2, 2), box(3, 1, 4, 2)};
+    const struct mpm_shape nested[] = {
+        box(0, 0, 5, 3), {.kind = MPM_SHAPE_UNION, .n_children = 2, .children = holes}};
+    both = (struct mpm_shape){.kind = MPM_SHAPE_DIFFERENCE, .n_children = 2, .children = nested};
+    assert_int_equal(count(&def, &both, 3, false), 9 * 13);
+}
+
+static void test_seed_of_nothing_is_empty(void **state) {
+    (void)state;
+    const struct mpm_def def = domain(2, 1, zero);
+    const struct mpm_shape apart[] = {box(1, 1, 2, 2), box(3, 3, 4, 4)};
+    const struct mpm_shape meet = {
+        .kind = MPM_SHAPE_INTERSECTION, .n_children = 2, .children = apart};
+    assert_int_equal(count(&def, &meet, 2, true), 0);
+    const struct mpm_shape none = {.kind = MPM_SHAPE_UNION};
+    assert_int_equal(count(&def, &none, 2, true), 0);
+    const struct mpm_shape thin = box(1, 1, 2, 1.1); // between the rows at 0.75 and 1.25
+    assert_int_equal(count(&def, &thin, 2, true), 0);
+}
+
+// The number of lattice points in a ball times their volume is its volume, up to half a spacing
+// along its surface.
+static void test_seed_ball_has_its_volume(void **state) {
+    (void)state;
+    const struct mpm_shape ball = {
+        .kind = MPM_SHAPE_BALL, .centre = {0.51, 0.48, 0.5}, .radius = 0.3};
+    for (int n = 1; n <= 8; n++) {
+        const struct mpm_def flat = domain(2, 0.1, zero), solid = domain(3, 0.1, zero);
+        const double spacing = 0.1 / n;
+        assert_near((double)count(&flat, &ball, n, false) * spacing * spacing, M_PI * 0.09,
+                    M_PI * 0.6 * spacing / 2);
+        assert_near((double)count(&solid, &ball, n, false) * pow(spacing, 3),
+                    4.0 / 3 * M_PI * 0.027, 4 * M_PI * 0.09 * spacing / 2);
+    }
+}
+
+// A ball whose surface goes through lattice points: 3-4-5 triangles, in half spacings.
+static void test_seed_ball_edge_is_open_or_closed(void **state) {
+    (void)state;
+    const struct mpm_def def = domain(2, 0.2, zero);
+    // Centre on a lattice point, radius 5 spacings: 81 points within, 12 of them on the circle.
+    const struct mpm_shape ball = {.kind = MPM_SHAPE_BALL, .centre = {1.05, 1.05}, .radius = 0.5};
+    assert_int_equal(count(&def, &ball, 2, true), 81);
+    assert_int_equal(count(&def, &ball, 2, false), 69);
+}
+
+struct list {
+    double x[4096][3], volume[4096];
+    size_t n, stop;
+    int dim;
+};
+static bool append(void *context, const double *x, double volume) {
+    struct list *list = context;
+    memcpy(list->x[list->n], x, (size_t)list->dim * sizeof *x);
+    list->volume[list->n++] = volume;
+    return list->n != list->stop;
+}
+static struct list lists[2];
+
+static void seed(struct list *list, const struct mpm_def *def, const struct mpm_shape *shape,
+                 int n) {
+    const struct mpm_body_def body = {.shape = *shape, .particles_per_direction = n};
+    *list = (struct list){.dim = def->dimension};
+    const size_t n_seeded = mpm_seed(def, &body, append, list);
+    assert_int_equal(n_seeded, list->n);
+}
+
+static void test_seed_places_cell_centred_lattice(void **state) {
+    (void)state;
+    const struct mpm_def def = domain(2, 1, zero);
+    const struct mpm_shape a = box(2, 3, 4, 4);
+    seed(&lists[0], &def, &a, 2);
+    assert_int_equal(lists[0].n, 8);
+    for (int i = 0; i < 4; i++) { // the last direction is the fastest
+        for (int j = 0; j < 2; j++) {
+            assert_near(lists[0].x[2 * i + j][0], 2.25 + 0.5 * i, 0);
+            assert_near(lists[0].x[2 * i + j][1], 3.25 + 0.5 * j, 0);
+            assert_near(lists[0].volume[2 * i + j], 0.25, 0);
+        }
+    }
+}
+
+// A shape with all kinds in it, for the tests of invariance.
+static void shift_and_scale(struct mpm_shape out[4], const double *corner, double scale) {
+    out[0] = box(0.1, 0.2, 0.8, 0.7);
+    out[1] = (struct mpm_shape){.kind = MPM_SHAPE_BALL, .centre = {0.4, 0.4}, .radius = 0.15};
+    for (int k = 0; k < 2; k++) {
+        for (int d = 0; d < 2; d++) {
+            out[k].min[d] = corner[d] + scale * out[k].min[d];
+            out[k].max[d] = corner[d] + scale * out[k].max[d];
+            out[k].centre[d] = corner[d] + scale * out[k].centre[d];
+        }
+        out[k].radius *= scale;
+    }
+    out[2] = (struct mpm_shape){.kind = MPM_SHAPE_DIFFERENCE, .n_children = 2, .children = out};
+}
+
+static void test_seed_does_not_depend_on_the_corner(void **state) {
+    (void)state;
+    const double corners[][3] = {{-3.7, 100.3}, {1e4 / 3, -1e4 / 7}, {-0.1, -0.9}};
+    struct mpm_shape here[4], there[4];
+    shift_and_scale(here, zero, 1);
+    for (int n = 1; n <= 4; n++) {
+        const struct mpm_def def = domain(2, 0.1, zero);
+        seed(&lists[0], &def, &here[2], n);
+        for (size_t c = 0; c < sizeof corners / sizeof *corners; c++) {
+            const struct mpm_def moved = domain(2, 0.1, corners[c]);
+            shift_and_scale(there, corners[c], 1);
+            seed(&lists[1], &moved, &there[2], n);
+            assert_int_equal(lists[1].n, lists[0].n);
+            for (size_t p = 0; p < lists[0].n; p++) {
+                for (int d = 0; d < 2; d++) { // round-off of the corner's coordinates
+                    assert_near(lists[1].x[p][d] - corners[c][d], lists[0].x[p][d], 1e-11);
+                }
+            }
+        }
+    }
+}
+
+// Powers of two are exact, so every bit but the exponent is the same.
+static void test_seed_scales_exactly(void **state) {
+    (void)state;
+    struct mpm_shape here[4], there[4];
+    shift_and_scale(here, zero, 1);
+    for (int k = -30; k <= 30; k += 15) {
+        const double scale = ldexp(1, k);
+        const struct mpm_def def = domain(2, 0.1, zero), scaled = domain(2, 0.1 * scale, zero);
+        shift_and_scale(there, zero, scale);
+        seed(&lists[0], &def, &here[2], 3);
+        seed(&lists[1], &scaled, &there[2], 3);
+        assert_int_equal(lists[1].n, lists[0].n);
+        assert_true(lists[0].n > 100);
+        for (size_t p = 0; p < lists[0].n; p++) {
+            assert_true(lists[1].x[p][0] == scale * lists[0].x[p][0]);
+            assert_true(lists[1].x[p][1] == scale * lists[0].x[p][1]);
+            assert_true(lists[1].volume[p] == scale * scale * lists[0].volume[p]);
+        }
+    }
+}
+
+static void test_seed_takes_points_as_they_are(void **state) {
+    (void)state;
+    const double points[] = {0.1, 0.2, 1e-3, 0.3, 0.25, 2e-3, 0.55, 0.5, 3e-3};
+    const struct mpm_shape shape = {.kind = MPM_SHAPE_POINTS, .n_points = 3, .points = points};
+    const struct mpm_def def = domain(2, 0.1, zero);
+    seed(&lists[0], &def, &shape, 2);
+    assert_int_equal(lists[0].n, 3);
+    for (int p = 0; p < 3; p++) {
+        assert_near(lists[0].x[p][0], points[3 * p], 0);
+        assert_near(lists[0].x[p][1], points[3 * p + 1], 0);
+        assert_near(lists[0].volume[p], points[3 * p + 2], 0);
+    }
+    assert_int_equal(count(&def, &shape, 2, false), 3);
+}
+
+static void test_seed_stops_when_told(void **state) {
+    (void)state;
+    const struct mpm_def def = domain(2, 1, zero);
+    const struct mpm_body_def body = {.shape = box(0, 0, 4, 4), .particles_per_direction = 2};
+    lists[0] = (struct list){.dim = 2, .stop = 5};
+    mpm_seed(&def, &body, append, &lists[0]);
+    assert_int_equal(lists[0].n, 5);
+}
+
+// Sides are told apart whatever the sign of the coordinates, with a margin at the edge.
+static void test_seed_shape_contains_a_point(void **state) {
+    (void)state;
+    const struct mpm_shape shape = box(-1, -2, 1, 2);
+    const double inside[] = {-0.9, 1.9}, edge[] = {1, 0}, outside[] = {0, 2.1};
+    assert_true(mpm_shape_contains(&shape, inside, 2, 0.05));
+    assert_false(mpm_shape_contains(&shape, edge, 2, 0.05));
+    assert_false(mpm_shape_contains(&shape, outside, 2, 0.05));
+}
+
+static void test_seed_velocity_fields(void **state) {
+    (void)state;
+    double v[3];
+    const double x[3] = {3, 5, 7};
+    struct mpm_velocity field = {.kind = MPM_VELOCITY_UNIFORM, .vector = {1, 2, 3}};
+    mpm_velocity_at(&field, x, 3, v);
+    assert_near(v[0], 1, 0), assert_near(v[1], 2, 0), assert_near(v[2], 3, 0);
+
+    field = (struct mpm_velocity){
+        .kind = MPM_VELOCITY_ROTATION, .centre = {1, 1, 1}, .rate = 2, .vector = {0, 0, 1}};
+    mpm_velocity_at(&field, x, 2, v);
+    assert_near(v[0], -8, 0), assert_near(v[1], 4, 0);
+    mpm_velocity_at(&field, x, 3, v); // about z: the same, and nothing along z
+    assert_near(v[0], -8, 0), assert_near(v[1], 4, 0), assert_near(v[2], 0, 0);
+    field.vector[0] = 1, field.vector[2] = 0; // about x
+    mpm_velocity_at(&field, x, 3, v);
+    assert_near(v[0], 0, 0), assert_near(v[1], -12, 0), assert_near(v[2], 8, 0);
+
+    field = (struct mpm_velocity){.kind = MPM_VELOCITY_MODE,
+                                  .axis = 1,
+                                  .number = 2,
+                                  .from = 1,
+                                  .length = 6,
+                                  .amplitude = 0.5};
+    mpm_velocity_at(&field, x, 2, v); // sin(3 pi/2 * 4/6) = sin(pi)
+    assert_near(v[0], 0, 0), assert_near(v[1], 0, 1e-15);
+    const double end[] = {0, 7};
+    mpm_velocity_at(&field, end, 2, v); // a free end is an antinode
+    assert_near(v[1], -0.5, 1e-15);
+}
+
+// The quick bound must hold, and must not be silly.
+static void test_seed_bound_is_close(void **state) {
+    (void)state;
+    const struct mpm_def def = domain(3, 0.1, zero);
+    const struct mpm_body_def body = {
+        .shape = {.kind = MPM_SHAPE_BOX, .min = {0.2, 0.2, 0.2}, .max = {0.8, 0.8, 0.8}},
+        .particles_per_direction = 4};
+    const double n = (double)mpm_seed(&def, &body, NULL, NULL);
+    assert_true(mpm_seed_bound(&def, &body) >= n && mpm_seed_bound(&def, &body) < 2 * n);
+}
+
+int main(int argc, char **argv) {
+    feenableexcept(FE_DIVBYZERO | FE_INVALID | FE_OVERFLOW);
+    const struct CMUnitTest tests[] = {
+        cmocka_unit_test(test_seed_fills_whole_cells),
+        cmocka_unit_test(test_seed_edges_are_open_or_closed),
+        cmocka_unit_test(test_seed_combines_shapes),
+        cmocka_unit_test(test_seed_of_nothing_is_empty),
+        cmocka_unit_test(test_seed_ball_has_its_volume),
+        cmocka_unit_test(test_seed_ball_edge_is_open_or_closed),
+        cmocka_unit_test(test_seed_places_cell_centred_lattice),
+        cmocka_unit_test(test_seed_does_not_depend_on_the_corner),
+        cmocka_unit_test(test_seed_scales_exactly),
+        cmocka_unit_test(test_seed_takes_points_as_they_are),
+        cmocka_unit_test(test_seed_stops_when_told),
+        cmocka_unit_test(test_seed_shape_contains_a_point),
+        cmocka_unit_test(test_seed_velocity_fields),
+        cmocka_unit_test(test_seed_bound_is_close),
+    };
+    cmocka_set_test_filter(argc > 1 ? argv[1] : NULL);
+    return cmocka_run_group_tests(tests, NULL, NULL);
+}
