@@ -161,6 +161,18 @@ static bool read_materials(struct scene *scene) {
     return true;
 }
 
+// Rows of `width` numbers.
+static bool read_points(struct scene *scene, const cJSON *rows, size_t width,
+                        struct mpm_shape *shape) {
+    shape->n_points = count(rows);
+    double *points = array(scene, shape->n_points * width, sizeof *points);
+    shape->points = points;
+    for (const cJSON *row = rows->child; row && points; row = row->next)
+        for (const cJSON *item = row->child; item; item = item->next)
+            *points++ = item->valuedouble;
+    return shape->points != NULL;
+}
+
 static bool read_shape(struct scene *scene, const cJSON *json, struct mpm_shape *shape) {
     const cJSON *form = json->child;
     const char *kind = form->string;
@@ -179,13 +191,26 @@ static bool read_shape(struct scene *scene, const cJSON *json, struct mpm_shape 
     }
     if (strcmp(kind, "points") == 0) {
         shape->kind = MPM_SHAPE_POINTS;
-        shape->n_points = count(form);
-        double *points = array(scene, shape->n_points * (size_t)(dimension + 1), sizeof *points);
-        shape->points = points;
-        for (const cJSON *row = form->child; row && points; row = row->next)
-            for (const cJSON *item = row->child; item; item = item->next)
-                *points++ = item->valuedouble;
-        return shape->points != NULL;
+        return read_points(scene, form, (size_t)dimension + 1, shape);
+    }
+    if (strcmp(kind, "polygon") == 0) {
+        shape->kind = MPM_SHAPE_POLYGON;
+        return read_points(scene, json_member(form, "points"), 2, shape);
+    }
+    if (strcmp(kind, "extrude") == 0) {
+        const cJSON *polygon = json_member(form, "polygon");
+        shape->kind = MPM_SHAPE_EXTRUDE;
+        shape->min[2] = number(form, "from");
+        shape->max[2] = number(form, "to");
+        return read_points(
+            scene, cJSON_IsObject(polygon) ? json_member(polygon, "points") : polygon, 2, shape);
+    }
+    if (strcmp(kind, "cylinder") == 0) {
+        shape->kind = MPM_SHAPE_CYLINDER;
+        vector(form, "from", shape->min);
+        vector(form, "to", shape->max);
+        shape->radius = number(form, "radius");
+        return true;
     }
     shape->kind = strcmp(kind, "union") == 0        ? MPM_SHAPE_UNION
                   : strcmp(kind, "difference") == 0 ? MPM_SHAPE_DIFFERENCE
@@ -267,6 +292,58 @@ static bool read_walls(struct scene *scene) {
     return true;
 }
 
+static bool read_loads(struct scene *scene) {
+    const cJSON *map = json_member(scene->json, "loads");
+    const cJSON *bodies = json_member(scene->json, "bodies");
+    struct mpm_def *def = &scene->def;
+    struct mpm_load_def *loads = array(scene, count(map), sizeof *loads);
+    if (!loads)
+        return false;
+    for (const cJSON *json = map->child; json; json = json->next) {
+        struct mpm_load_def *load = &loads[def->n_loads++];
+        const cJSON *select = json_member(json, "select"), *box = json_member(select, "box");
+        const char *extreme = text(select, "extreme");
+        load->name = json->string;
+        load->body = index_of(bodies, text(json, "body"));
+        load->has_box = box != NULL;
+        vector(box, "min", load->box_min);
+        vector(box, "max", load->box_max);
+        if (!box) {
+            load->max_side = extreme[0] == '+';
+            load->round = extreme[1] == 'r';
+            load->axis = load->round ? axis(select, "axis") : extreme[1] - 'x';
+            vector(select, "center", load->centre);
+        }
+        load->is_pressure = json_member(json, "pressure") != NULL;
+        vector(json, "force", load->force);
+        load->pressure = number(json, "pressure");
+        load->ramp = number(json, "ramp");
+    }
+    def->loads = loads;
+    return true;
+}
+
+static bool read_rigid_bodies(struct scene *scene) {
+    const cJSON *map = json_member(scene->json, "rigid_bodies");
+    struct mpm_def *def = &scene->def;
+    struct mpm_rigid_def *rigids = array(scene, count(map), sizeof *rigids);
+    if (!rigids)
+        return false;
+    for (const cJSON *json = map->child; json; json = json->next) {
+        struct mpm_rigid_def *rigid = &rigids[def->n_rigids++];
+        const cJSON *contact = json_member(json, "contact");
+        rigid->name = json->string;
+        vector(json, "velocity", rigid->velocity);
+        rigid->stiffness = number(contact, "stiffness");
+        rigid->distance = number(contact, "distance");
+        rigid->friction = number(contact, "friction");
+        if (!read_shape(scene, json_member(json, "shape"), &rigid->shape))
+            return false;
+    }
+    def->rigids = rigids;
+    return true;
+}
+
 // Patches accumulate: a stage keeps what the stages before it changed.
 static bool patch_materials(struct scene *scene, const cJSON *patch,
                             const struct mpm_material_def *before, struct mpm_stage_def *stage) {
@@ -331,9 +408,25 @@ static void read_stage_settings(const cJSON *json, struct mpm_stage_def *stage) 
     }
 }
 
+// Flags for the members of `map`, `n` of them, whose names are in the list; NULL in `out` for none.
+static bool read_removed(struct scene *scene, const cJSON *names, const cJSON *map, size_t n,
+                         const bool **out) {
+    if (!names || !names->child)
+        return true;
+    bool *removes = array(scene, n, sizeof *removes);
+    if (!removes)
+        return false;
+    for (const cJSON *name = names->child; name; name = name->next)
+        removes[index_of(map, name->valuestring)] = true;
+    *out = removes;
+    return true;
+}
+
 static bool read_stages(struct scene *scene) {
     const cJSON *list = json_member(scene->json, "stages");
     const cJSON *walls = json_member(scene->json, "walls");
+    const cJSON *loads = json_member(scene->json, "loads");
+    const cJSON *rigids = json_member(scene->json, "rigid_bodies");
     struct mpm_def *def = &scene->def;
     struct mpm_stage_def *stages = array(scene, count(list), sizeof *stages);
     if (!stages)
@@ -342,7 +435,7 @@ static bool read_stages(struct scene *scene) {
     for (const cJSON *json = list->child; json; json = json->next) {
         struct mpm_stage_def *stage = &stages[def->n_stages++];
         const cJSON *until = json_member(json, "until"), *patch = json_member(json, "materials");
-        const cJSON *removed = json_member(json_member(json, "remove"), "walls");
+        const cJSON *remove = json_member(json, "remove");
         const cJSON *resets = json_member(json, "reset");
         stage->name = text(json, "name");
         stage->duration = !json->next ? scene->config.end
@@ -356,14 +449,13 @@ static bool read_stages(struct scene *scene) {
                              : strcmp(word->valuestring, "plastic_strain") == 0
                                  ? MPM_RESET_PLASTIC_STRAIN
                                  : MPM_RESET_DISPLACEMENT;
-        if (removed && removed->child) {
-            bool *removes = array(scene, def->n_walls, sizeof *removes);
-            if (!removes)
-                return false;
-            for (const cJSON *name = removed->child; name; name = name->next)
-                removes[index_of(walls, name->valuestring)] = true;
-            stage->removes_wall = removes;
-        }
+        if (!read_removed(scene, json_member(remove, "walls"), walls, def->n_walls,
+                          &stage->removes_wall) ||
+            !read_removed(scene, json_member(remove, "loads"), loads, def->n_loads,
+                          &stage->removes_load) ||
+            !read_removed(scene, json_member(remove, "rigid_bodies"), rigids, def->n_rigids,
+                          &stage->removes_rigid))
+            return false;
         if (patch && patch->child) {
             if (!patch_materials(scene, patch, materials, stage))
                 return false;
@@ -378,6 +470,7 @@ static bool read_probes(struct scene *scene) {
     const cJSON *map = json_member(scene->json, "probes");
     const cJSON *bodies = json_member(scene->json, "bodies");
     const cJSON *walls = json_member(scene->json, "walls");
+    const cJSON *rigids = json_member(scene->json, "rigid_bodies");
     struct mpm_def *def = &scene->def;
     struct mpm_probe_def *probes = array(scene, count(map), sizeof *probes);
     if (!probes)
@@ -389,6 +482,7 @@ static bool read_probes(struct scene *scene) {
         probe->kind = (enum mpm_probe_kind)mpm_probe_kind_parse(text(json, "kind"));
         probe->body = index_of(bodies, text(json, "body")); // no name: -1, all
         probe->wall = index_of(walls, text(json, "wall"));
+        probe->rigid = index_of(rigids, text(json, "rigid_body"));
         probe->field = field ? mpm_field_parse(field->valuestring) : 0;
         probe->axis = axis(json, "axis");
         probe->max_side = text_is(json, "side", "max");
@@ -465,8 +559,9 @@ static bool read_definition(struct scene *scene) {
     def->memory_limit = physical_memory();
     def->wants_displacement = wants(root, MPM_FIELD_DISPLACEMENT);
     def->wants_volume_ratio = wants(root, MPM_FIELD_VOLUME_RATIO);
-    return read_materials(scene) && read_bodies(scene) && read_walls(scene) && read_stages(scene) &&
-           read_probes(scene) && read_references(scene);
+    return read_materials(scene) && read_bodies(scene) && read_walls(scene) && read_loads(scene) &&
+           read_rigid_bodies(scene) && read_stages(scene) && read_probes(scene) &&
+           read_references(scene);
 }
 
 // ---- Public -------------------------------------------------------------------------------------

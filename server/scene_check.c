@@ -202,6 +202,27 @@ static void check_points(struct check *check, const cJSON *json, const struct sc
     }
 }
 
+// That its edges do not meet is for the solver to see.
+static void check_outline(struct check *check, const struct scene_value *value, const cJSON *json,
+                          const struct scene_cursor *at) {
+    if (!cJSON_IsArray(json)) {
+        type_fault(check, at, value, json);
+        return;
+    }
+    int n = cJSON_GetArraySize(json);
+    char expected[40];
+    snprintf(expected, sizeof expected, "from 3 to %d points", SCENE_MAX_OUTLINE);
+    if (n < 3 || n > SCENE_MAX_OUTLINE) {
+        scene_value_fault(check->faults, at, "count", expected, json);
+        return;
+    }
+    size_t i = 0;
+    for (const cJSON *row = json->child; row; row = row->next, i++) {
+        struct scene_cursor here = {.parent = at, .index = i};
+        check_numbers(check, "a point", 2, row, &here);
+    }
+}
+
 // ---- Objects ------------------------------------------------------------------------------------
 
 static bool present(const cJSON *object, const struct scene_key *keys, const char *name) {
@@ -453,6 +474,7 @@ static bool type_fits(const struct scene_value *value, const cJSON *json) {
         return cJSON_IsString(json);
     case SCENE_VECTOR:
     case SCENE_POINTS:
+    case SCENE_OUTLINE:
     case SCENE_LIST:
         return cJSON_IsArray(json);
     case SCENE_OBJECT:
@@ -460,7 +482,6 @@ static bool type_fits(const struct scene_value *value, const cJSON *json) {
     case SCENE_MAP:
     case SCENE_MATERIAL:
     case SCENE_MATERIAL_PATCH:
-    case SCENE_EMPTY:
         return cJSON_IsObject(json);
     case SCENE_EITHER:
         break;
@@ -578,6 +599,9 @@ static void check_value(struct check *check, const struct scene_value *value, cJ
     case SCENE_POINTS:
         check_points(check, json, at);
         break;
+    case SCENE_OUTLINE:
+        check_outline(check, value, json, at);
+        break;
     case SCENE_OBJECT:
         if (!cJSON_IsObject(json)) {
             type_fault(check, at, value, json);
@@ -607,13 +631,6 @@ static void check_value(struct check *check, const struct scene_value *value, cJ
         break;
     case SCENE_MATERIAL_PATCH:
         check_material_patch(check, json, at);
-        break;
-    case SCENE_EMPTY:
-        if (!cJSON_IsObject(json))
-            type_fault(check, at, value, json);
-        else if (json->child)
-            scene_fault(check->faults, at, "unsupported", "an empty object", NULL,
-                        "`%s` cannot be used in this version of fbard; leave it empty", at->key);
         break;
     }
 }
@@ -646,17 +663,70 @@ static void check_stages(struct check *check, const cJSON *stages,
     }
 }
 
-// A displacement is that of one place or the mean over a box.
+// `+r` and `-r` are about a centre, in 3D about an axis through it; other extremes are not.
+static void check_extreme(struct check *check, const cJSON *select, const char *extreme,
+                          const struct scene_cursor *at) {
+    static const char *const keys[] = {"center", "axis"};
+    bool round = extreme[1] == 'r';
+    struct scene_cursor here = {.parent = at, .key = "extreme"};
+    if (extreme[1] == 'z' && check->dimension == 2)
+        scene_value_fault(check->faults, &here, "dimension", "an extreme along x, y or r in 2D",
+                          json_member(select, "extreme"));
+    for (int i = 0; i < 2; i++) {
+        here.key = keys[i];
+        bool is_there = json_member(select, keys[i]) != NULL;
+        if (is_there && !round)
+            scene_fault(check->faults, &here, "conflict", "absent", NULL,
+                        "`%s` does not go with extreme \"%s\"", keys[i], extreme);
+        if (!is_there && round && (i == 0 || check->dimension == 3))
+            scene_fault(check->faults, &here, "required",
+                        i ? "one of \"x\", \"y\", \"z\"" : "a vector in m", NULL,
+                        "extreme \"%s\" needs `%s`", extreme, keys[i]);
+    }
+}
+
+static void check_loads(struct check *check, const cJSON *loads, const struct scene_cursor *root) {
+    struct scene_cursor map = {.parent = root, .key = "loads"};
+    for (const cJSON *load = loads->child; load; load = load->next) {
+        struct scene_cursor item = {.parent = &map, .key = load->string};
+        struct scene_cursor selected = {.parent = &item, .key = "select"};
+        struct scene_cursor force = {.parent = &item, .key = "force"};
+        struct scene_cursor pressure = {.parent = &item, .key = "pressure"};
+        const cJSON *select = json_member(load, "select"), *box = json_member(select, "box");
+        const cJSON *extreme = json_member(select, "extreme");
+        if (!cJSON_IsObject(load))
+            continue;
+        if (!json_member(load, "force") && !json_member(load, "pressure"))
+            scene_fault(check->faults, &force, "required", "a vector in N", NULL,
+                        "a load needs `force` or `pressure`");
+        if (box && json_member(load, "pressure"))
+            scene_fault(check->faults, &pressure, "conflict", "absent", NULL,
+                        "a pressure acts on a layer and not on a box; select an extreme");
+        if (cJSON_IsObject(select) && !box && !extreme)
+            scene_fault(check->faults, &selected, "required", "`extreme` or `box`", NULL,
+                        "`select` needs `extreme` or `box`");
+        if (!box && cJSON_IsString(extreme) && strlen(extreme->valuestring) == 2)
+            check_extreme(check, select, extreme->valuestring, &selected);
+    }
+}
+
+// A displacement is that of one place or the mean over a box; a reaction is on a wall or a rigid
+// body.
 static void check_probes(struct check *check, const cJSON *probes,
                          const struct scene_cursor *root) {
     struct scene_cursor map = {.parent = root, .key = "probes"};
     for (const cJSON *probe = probes->child; probe; probe = probe->next) {
         struct scene_cursor item = {.parent = &map, .key = probe->string};
         struct scene_cursor at = {.parent = &item, .key = "at"};
-        const cJSON *kind = json_member(probe, "kind");
-        if (cJSON_IsString(kind) &&
-            mpm_probe_kind_parse(kind->valuestring) == MPM_PROBE_DISPLACEMENT &&
-            !json_member(probe, "at") && !json_member(probe, "box"))
+        struct scene_cursor wall = {.parent = &item, .key = "wall"};
+        const cJSON *word = json_member(probe, "kind");
+        int kind = cJSON_IsString(word) ? mpm_probe_kind_parse(word->valuestring) : -1;
+        if (kind == MPM_PROBE_REACTION && !json_member(probe, "wall") &&
+            !json_member(probe, "rigid_body"))
+            scene_fault(check->faults, &wall, "required", "a name in `walls`", NULL,
+                        "a reaction needs `wall` or `rigid_body`");
+        if (kind == MPM_PROBE_DISPLACEMENT && !json_member(probe, "at") &&
+            !json_member(probe, "box"))
             scene_fault(check->faults, &at, "required", "a vector in m", NULL,
                         "a displacement needs `at`, or `box` for the mean over it");
     }
@@ -763,6 +833,9 @@ void scene_check(cJSON *scene, struct faults *faults) {
     stages = json_member(scene, "stages");
     if (cJSON_IsArray(stages))
         check_stages(&check, stages, &root);
+    const cJSON *loads = json_member(scene, "loads");
+    if (cJSON_IsObject(loads) && cJSON_GetArraySize(loads) <= SCENE_MAX_NAMED)
+        check_loads(&check, loads, &root);
     const cJSON *probes = json_member(scene, "probes");
     if (cJSON_IsObject(probes) && cJSON_GetArraySize(probes) <= SCENE_MAX_NAMED)
         check_probes(&check, probes, &root);

@@ -19,6 +19,8 @@ CHOICES(transfer, "flip")
 CHOICES(keeps, "above", "below")
 CHOICES(side, "min", "max")
 CHOICES(edge, "open", "closed")
+CHOICES(contact, "barrier")
+CHOICES(extreme, "+x", "-x", "+y", "-y", "+z", "-z", "+r", "-r")
 CHOICES(end, "end")
 CHOICES(when_full, "block", "fail")
 CHOICES(durability, "process", "power")
@@ -74,7 +76,8 @@ const char *scene_model_choice(size_t index) {
 #define END                                                                                        \
     { .name = NULL }
 
-static const struct scene_value name_of_wall = NAME("walls");
+static const struct scene_value name_of_wall = NAME("walls"), name_of_load = NAME("loads");
+static const struct scene_value name_of_rigid = NAME("rigid_bodies");
 static const struct scene_value reset_word = CHOICE(reset);
 static const struct scene_value field_word = CHOICE(field);
 
@@ -94,11 +97,41 @@ static const struct scene_key ball_keys[] = {
 #define BALL                                                                                       \
     { .type = SCENE_OBJECT, .keys = ball_keys, .section = "Disks and spheres" }
 
+#define OUTLINE                                                                                    \
+    { .type = SCENE_OUTLINE, .unit = "m" }
+static const struct scene_key polygon_keys[] = {
+    {"points", OUTLINE, .required = true,
+     .doc = "`[[x, y], ...]`: the corners in order, either way round; edges must not meet again"},
+    END};
+#define POLYGON                                                                                    \
+    { .type = SCENE_OBJECT, .keys = polygon_keys, .section = "Polygons" }
+static const struct scene_value outline_forms[] = {OUTLINE, POLYGON};
+
+static const struct scene_key extrude_keys[] = {
+    {"polygon", EITHER(outline_forms), .required = true, .doc = "the section in x and y"},
+    {"from", NUMBER("m"), .required = true, .doc = "where it begins in z"},
+    {"to", NUMBER("m"), .required = true, .doc = "where it ends in z, above `from`"},
+    END};
+static const struct scene_key cylinder_keys[] = {
+    {"from", VECTOR("m"), .required = true, .doc = "centre of one end"},
+    {"to", VECTOR("m"), .required = true, .doc = "centre of the other end"},
+    {"radius", POSITIVE("m"), .required = true, .doc = "radius"},
+    END};
+
 static const struct scene_value shape;
 static const struct scene_key shape_keys[] = {
     {"box", BOX, .doc = "an upright box"},
     {"disk", BALL, .dimension = 2, .doc = "a disk"},
     {"sphere", BALL, .dimension = 3, .doc = "a ball"},
+    {"polygon", POLYGON, .dimension = 2, .doc = "a polygon"},
+    {"extrude",
+     {.type = SCENE_OBJECT, .keys = extrude_keys, .section = "Extrusions"},
+     .dimension = 3,
+     .doc = "a prism along z"},
+    {"cylinder",
+     {.type = SCENE_OBJECT, .keys = cylinder_keys, .section = "Cylinders"},
+     .dimension = 3,
+     .doc = "a round cylinder along any axis"},
     {"points",
      {.type = SCENE_POINTS, .unit = "m, m^dimension"},
      .doc = "`[[x, y, volume], ...]`: these particles and no lattice; volume per metre in 2D"},
@@ -250,6 +283,66 @@ static const struct scene_key wall_keys[] = {
 static const struct scene_value wall = {
     .type = SCENE_OBJECT, .keys = wall_keys, .section = "`walls.NAME`"};
 
+// ---- Loads --------------------------------------------------------------------------------------
+
+static const struct scene_key select_keys[] = {
+    {"box", BOX, .doc = "the particles that start in this box, its edge included"},
+    {"extreme", CHOICE(extreme), .excludes = "box",
+     .doc = "the outermost layer of particles on that side; `+r`, `-r`: the outermost, innermost "
+            "about `center`"},
+    {"center", VECTOR("m"), .excludes = "box",
+     .doc = "a point that `+r` and `-r` go out from, which need it"},
+    {"axis", AXIS, .dimension = 3, .excludes = "box",
+     .doc = "direction of the axis through `center`, which `+r` and `-r` need"},
+    END};
+static const struct scene_key load_keys[] = {
+    {"body", NAME("bodies"), .required = true, .doc = "the body that it acts on"},
+    {"select",
+     {.type = SCENE_OBJECT, .keys = select_keys, .section = "A load's `select`"},
+     .required = true,
+     .doc = "its particles, by where they start; it has either `extreme` or `box`"},
+    {"force", VECTOR("N"),
+     .doc = "force in all, shared equally by the particles; per metre of thickness in 2D"},
+    {"pressure", NUMBER("Pa"), .excludes = "force",
+     .doc = "pressure onto the body, normal to the layer that `extreme` names"},
+    {"ramp", NOT_NEGATIVE("s"), .fallback = "0",
+     .doc = "grows linearly over this time, from the first step on"},
+    END};
+static const struct scene_value load = {
+    .type = SCENE_OBJECT, .keys = load_keys, .section = "`loads.NAME`"};
+
+// ---- Rigid bodies -------------------------------------------------------------------------------
+
+// Those that contact.c knows the distance from.
+static const struct scene_key rigid_shape_keys[] = {
+    {"box", BOX, .doc = "an upright box"},
+    {"disk", BALL, .dimension = 2, .doc = "a disk"},
+    {"sphere", BALL, .dimension = 3, .doc = "a ball"},
+    {"polygon", POLYGON, .dimension = 2, .doc = "a polygon"},
+    END};
+static const struct scene_key contact_keys[] = {
+    {"kind", CHOICE(contact), .fallback = "\"barrier\"",
+     .doc = "a pressure that grows without end"},
+    {"stiffness", POSITIVE("Pa"), .required = true,
+     .doc = "k of the pressure k [2 (d - D) ln(d/D) + (d - D)^2/d] / D at the distance d < D"},
+    {"distance", POSITIVE("m"), .required = true,
+     .doc = "D: nearer particles are pushed away; less than `cell`"},
+    {"friction", NOT_NEGATIVE("1"), .fallback = "0", .doc = "Coulomb's coefficient"},
+    END};
+static const struct scene_key rigid_keys[] = {
+    {"shape",
+     {.type = SCENE_ONE_KEY, .keys = rigid_shape_keys, .section = "A rigid body's `shape`"},
+     .required = true,
+     .doc = "the space that it takes at the start, with no particle in it"},
+    {"velocity", VECTOR("m/s"), .fallback = "0", .doc = "velocity at which it moves throughout"},
+    {"contact",
+     {.type = SCENE_OBJECT, .keys = contact_keys, .section = "A rigid body's `contact`"},
+     .required = true,
+     .doc = "how it acts on particles"},
+    END};
+static const struct scene_value rigid_body = {
+    .type = SCENE_OBJECT, .keys = rigid_keys, .section = "`rigid_bodies.NAME`"};
+
 // ---- Stages -------------------------------------------------------------------------------------
 
 static const struct scene_key until_keys[] = {
@@ -281,6 +374,12 @@ static const struct scene_key remove_keys[] = {
     {"walls",
      {.type = SCENE_LIST, .items = &name_of_wall, .unique = true},
      .doc = "names of walls that go"},
+    {"loads",
+     {.type = SCENE_LIST, .items = &name_of_load, .unique = true},
+     .doc = "names of loads that end"},
+    {"rigid_bodies",
+     {.type = SCENE_LIST, .items = &name_of_rigid, .unique = true},
+     .doc = "names of rigid bodies that go"},
     END};
 static const struct scene_key stage_keys[] = {
     {"name", TEXT, .required = true, .doc = "shown with the run's progress"},
@@ -325,8 +424,9 @@ static const struct scene_key probe_keys[] = {
     {"kind", CHOICE(probe), .required = true, .selector = true, .doc = "what is measured"},
     {"body", NAME("bodies"), .only = PARTICLES | KIND(EXTENT) | KIND(DRIFT),
      .doc = "only this body; without it, all"},
-    {"wall", NAME("walls"), .only = KIND(REACTION), .needs = KIND(REACTION),
-     .doc = "the force on this wall"},
+    {"wall", NAME("walls"), .only = KIND(REACTION), .doc = "the force on this wall"},
+    {"rigid_body", NAME("rigid_bodies"), .only = KIND(REACTION), .excludes = "wall",
+     .doc = "the force on this rigid body; a reaction is that of one of the two"},
     {"field", CHOICE(field), .only = KIND(FIELD) | FOLDS, .needs = KIND(FIELD) | FOLDS,
      .doc = "the field"},
     {"axis", AXIS, .only = KIND(EXTENT), .needs = KIND(EXTENT), .doc = "along this axis"},
@@ -394,8 +494,14 @@ static const struct scene_key root_keys[] = {
      .required = true,
      .doc = "what is filled with particles"},
     {"walls", {.type = SCENE_MAP, .items = &wall}, .fallback = "{}", .doc = "plane boundaries"},
-    {"loads", {.type = SCENE_EMPTY}, .fallback = "{}", .doc = "none in this version"},
-    {"rigid_bodies", {.type = SCENE_EMPTY}, .fallback = "{}", .doc = "none in this version"},
+    {"loads",
+     {.type = SCENE_MAP, .items = &load},
+     .fallback = "{}",
+     .doc = "forces on particles, which they follow"},
+    {"rigid_bodies",
+     {.type = SCENE_MAP, .items = &rigid_body},
+     .fallback = "{}",
+     .doc = "bodies that move as they are told and touch every deformable one"},
     {"stages",
      {.type = SCENE_LIST, .items = &stage},
      .fallback = "[{\"name\": \"run\"}]",
@@ -516,6 +622,9 @@ void scene_describe(const struct scene_value *value, char *out, size_t n) {
     case SCENE_POINTS:
         append(out, n, "%s", "an array of positions with a volume");
         break;
+    case SCENE_OUTLINE:
+        append(out, n, "%s", "an array of 3 or more points [x, y]");
+        break;
     case SCENE_OBJECT:
     case SCENE_MATERIAL:
     case SCENE_MATERIAL_PATCH:
@@ -543,9 +652,6 @@ void scene_describe(const struct scene_value *value, char *out, size_t n) {
             scene_describe(&value->items[i], one, sizeof one);
             append(out, n, i ? ", or %s" : "%s", one);
         }
-        break;
-    case SCENE_EMPTY:
-        append(out, n, "%s", "an empty object");
         break;
     }
     if (value->unit && strcmp(value->unit, "1") != 0)

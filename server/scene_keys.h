@@ -7,8 +7,9 @@
 #include "server/mpm/mpm.h"
 
 // What nonsense may not exceed; a scene is refused before anything of this size is built.
-#define SCENE_MAX_NAMED 1000 // materials, bodies, walls, probes, stages, references: each
+#define SCENE_MAX_NAMED 1000 // materials, bodies, walls, loads, probes, ...: each
 #define SCENE_MAX_POINTS 10000000
+#define SCENE_MAX_OUTLINE 1000 // points of a polygon; every edge is held against every other
 #define SCENE_MAX_SHAPE_DEPTH 16
 #define SCENE_MAX_TEXT 200 // characters
 #define SCENE_NAME_PATTERN "^[A-Za-z_][A-Za-z0-9_-]{0,63}$"
@@ -24,6 +25,7 @@ enum scene_type {
     SCENE_NAME,           // names a member of the scene's map `of`
     SCENE_VECTOR,         // `dimension` numbers
     SCENE_POINTS,         // rows of a position and a volume
+    SCENE_OUTLINE,        // the corners [x, y] of a polygon
     SCENE_OBJECT,         // `keys`
     SCENE_ONE_KEY,        // an object with exactly one of `keys`
     SCENE_MAP,            // an object of `items` keyed by name
@@ -31,7 +33,6 @@ enum scene_type {
     SCENE_EITHER,         // `items`, `n_items` of them, that differ in their JSON type
     SCENE_MATERIAL,       // keys by `model`: scene_material_keys
     SCENE_MATERIAL_PATCH, // a merge patch of the scene's materials
-    SCENE_EMPTY,          // an object that must be empty in this version
 };
 
 struct scene_value {

@@ -26,14 +26,14 @@ static void put_bounds(cJSON *schema, const struct scene_value *value) {
         put_number(schema, value->max_open ? "exclusiveMaximum" : "maximum", value->max);
 }
 
-// {"type": "array", "items": {"type": "number"}} of the lengths that dimensions 2 and 3 give.
-static cJSON *numbers_schema(int beyond_dimension) {
+// {"type": "array", "items": {"type": "number"}} of these lengths.
+static cJSON *numbers_schema(int least, int most) {
     cJSON *schema = cJSON_CreateObject(), *item = cJSON_CreateObject();
     put_text(schema, "type", "array");
     put_text(item, "type", "number");
     cJSON_AddItemToObject(schema, "items", item);
-    put_number(schema, "minItems", 2 + beyond_dimension);
-    put_number(schema, "maxItems", 3 + beyond_dimension);
+    put_number(schema, "minItems", least);
+    put_number(schema, "maxItems", most);
     return schema;
 }
 
@@ -162,7 +162,7 @@ static cJSON *value_schema(const struct scene_value *value) {
     const char *word;
     switch (value->type) {
     case SCENE_VECTOR:
-        return numbers_schema(0);
+        return numbers_schema(2, MPM_MAX_DIM);
     case SCENE_OBJECT:
         return object_schema(value->keys);
     case SCENE_MATERIAL:
@@ -210,9 +210,15 @@ static cJSON *value_schema(const struct scene_value *value) {
         break;
     case SCENE_POINTS:
         put_text(schema, "type", "array");
-        cJSON_AddItemToObject(schema, "items", numbers_schema(1));
+        cJSON_AddItemToObject(schema, "items", numbers_schema(3, MPM_MAX_DIM + 1));
         put_number(schema, "minItems", 1);
         put_number(schema, "maxItems", SCENE_MAX_POINTS);
+        break;
+    case SCENE_OUTLINE:
+        put_text(schema, "type", "array");
+        cJSON_AddItemToObject(schema, "items", numbers_schema(2, 2));
+        put_number(schema, "minItems", 3);
+        put_number(schema, "maxItems", SCENE_MAX_OUTLINE);
         break;
     case SCENE_ONE_KEY: {
         char reference[64];
@@ -248,10 +254,6 @@ static cJSON *value_schema(const struct scene_value *value) {
         put_text(patch, "type", "object");
         break;
     }
-    case SCENE_EMPTY:
-        put_text(schema, "type", "object");
-        put_number(schema, "maxProperties", 0);
-        break;
     }
     return schema;
 }

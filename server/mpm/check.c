@@ -71,6 +71,9 @@ static double largest_speed(const struct mpm_def *def) {
         }
         largest = fmax(largest, sqrt(speed2));
     }
+    for (size_t k = 0; k < def->n_rigids; k++) { // what it hits moves on as fast
+        largest = fmax(largest, mpm_rigid_speed(&def->rigids[k], def->dimension));
+    }
     return largest;
 }
 
@@ -198,6 +201,144 @@ static void check_material(struct report *r, const struct mpm_material_def *m, c
         check_material_whole(r, m, prefix);
     }
 }
+
+// ---- Shapes -------------------------------------------------------------------------------------
+
+// > 0 where c lies left of the way from a to b, 0 on their line.
+static double turn(const double *a, const double *b, const double *c) {
+    return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]);
+}
+
+// Of a point on the line through a and b: whether it lies between them.
+static bool is_between(const double *a, const double *b, const double *c) {
+    return c[0] >= fmin(a[0], b[0]) && c[0] <= fmax(a[0], b[0]) && c[1] >= fmin(a[1], b[1]) &&
+           c[1] <= fmax(a[1], b[1]);
+}
+
+static bool segments_meet(const double *a, const double *b, const double *c, const double *d) {
+    const double abc = turn(a, b, c), abd = turn(a, b, d), cda = turn(c, d, a), cdb = turn(c, d, b);
+    if (((abc > 0 && abd < 0) || (abc < 0 && abd > 0)) &&
+        ((cda > 0 && cdb < 0) || (cda < 0 && cdb > 0))) {
+        return true;
+    }
+    return (abc == 0 && is_between(a, b, c)) || (abd == 0 && is_between(a, b, d)) ||
+           (cda == 0 && is_between(c, d, a)) || (cdb == 0 && is_between(c, d, b));
+}
+
+// A simple polygon with an area: no corner twice, and no two edges that meet but at their corner.
+static void check_polygon(struct report *r, const struct mpm_shape *shape, const char *pointer) {
+    const size_t n = shape->n_points;
+    const double *x = shape->points;
+    double area = 0;
+    if (n < 3) {
+        FAULT(r, MPM_ERR_EMPTY, pointer, "at least 3 points", TEXT("%zu", n),
+              "a polygon has at least 3 corners, got %zu", n);
+        return;
+    }
+    for (size_t i = 0; i < 2 * n; i++) {
+        if (!is_finite(x[i])) {
+            FAULT(r, MPM_ERR_RANGE, pointer, "finite coordinates, m", TEXT("%.9g", x[i]),
+                  "corner %zu of the polygon is not finite", i / 2);
+            return;
+        }
+    }
+    for (size_t i = 0; i < n; i++) {
+        area += turn(x, x + 2 * i, x + 2 * ((i + 1) % n)) / 2;
+    }
+    for (size_t i = 0; i < n; i++) {
+        const double *a = x + 2 * i, *b = x + 2 * ((i + 1) % n);
+        if (a[0] == b[0] && a[1] == b[1]) {
+            FAULT(r, MPM_ERR_CONFLICT, pointer, "every corner once",
+                  TEXT("corners %zu and %zu are the same", i, (i + 1) % n),
+                  "corners %zu and %zu of the polygon are the same point; it closes by itself", i,
+                  (i + 1) % n);
+            return;
+        }
+    }
+    if (area == 0) {
+        FAULT(r, MPM_ERR_EMPTY, pointer, "a polygon with an area", "0 m^2",
+              "the polygon has no area: its corners lie on a line, or its edges cross");
+        return;
+    }
+    for (size_t i = 0; i < n; i++) {
+        const double *a = x + 2 * i, *b = x + 2 * ((i + 1) % n), *c = x + 2 * ((i + 2) % n);
+        const double back = (a[0] - b[0]) * (c[0] - b[0]) + (a[1] - b[1]) * (c[1] - b[1]);
+        size_t other = turn(a, b, c) == 0 && back > 0 ? (i + 1) % n : n; // folds back on itself
+        for (size_t j = i + 2; other == n && j < n; j++) {
+            if ((j + 1) % n != i && segments_meet(a, b, x + 2 * j, x + 2 * ((j + 1) % n))) {
+                other = j;
+            }
+        }
+        if (other < n) {
+            FAULT(r, MPM_ERR_CONFLICT, pointer, "edges that do not meet again",
+                  TEXT("the edges from corners %zu and %zu meet", i, other),
+                  "the polygon meets itself: the edge from corner %zu at (%.9g, %.9g) and that "
+                  "from corner %zu at (%.9g, %.9g)",
+                  i, a[0], a[1], other, x[2 * other], x[2 * other + 1]);
+            return;
+        }
+    }
+}
+
+static void check_shape(struct report *r, const struct mpm_shape *shape, const char *pointer,
+                        int dim) {
+    static const char *const sets[] = {[MPM_SHAPE_UNION] = "union",
+                                       [MPM_SHAPE_DIFFERENCE] = "difference",
+                                       [MPM_SHAPE_INTERSECTION] = "intersection"};
+    double length = 0;
+    switch (shape->kind) {
+    case MPM_SHAPE_BOX:
+    case MPM_SHAPE_BALL:
+    case MPM_SHAPE_POINTS:
+        break; // whatever they say, they hold particles or do not
+    case MPM_SHAPE_POLYGON:
+        if (dim != 2) {
+            FAULT(r, MPM_ERR_CONFLICT, TEXT("%s/polygon", pointer), "a scene in 2D", "3D",
+                  "a polygon alone is for scenes in 2D; extrude it");
+        }
+        check_polygon(r, shape, TEXT("%s/polygon/points", pointer));
+        break;
+    case MPM_SHAPE_EXTRUDE:
+        if (dim != 3) {
+            FAULT(r, MPM_ERR_CONFLICT, TEXT("%s/extrude", pointer), "a scene in 3D", "2D",
+                  "an extrusion is for scenes in 3D");
+        }
+        check_polygon(r, shape, TEXT("%s/extrude/polygon", pointer));
+        if (!(shape->max[2] > shape->min[2] && is_finite(shape->max[2] - shape->min[2]))) {
+            FAULT(r, MPM_ERR_RANGE, TEXT("%s/extrude/to", pointer),
+                  TEXT("above %.9g m (from)", shape->min[2]), TEXT("%.9g", shape->max[2]),
+                  "an extrusion must end above where it begins");
+        }
+        break;
+    case MPM_SHAPE_CYLINDER:
+        if (dim != 3) {
+            FAULT(r, MPM_ERR_CONFLICT, TEXT("%s/cylinder", pointer), "a scene in 3D", "2D",
+                  "a cylinder is for scenes in 3D");
+        }
+        for (int d = 0; d < dim; d++) {
+            length = hypot(length, shape->max[d] - shape->min[d]);
+        }
+        if (!(length > 0 && is_finite(length))) {
+            FAULT(r, MPM_ERR_RANGE, TEXT("%s/cylinder/to", pointer), "another point than `from`",
+                  TEXT("%.9g m from it", length), "a cylinder must have a length");
+        }
+        if (!(shape->radius > 0 && is_finite(shape->radius))) {
+            FAULT(r, MPM_ERR_RANGE, TEXT("%s/cylinder/radius", pointer), "above 0, m",
+                  TEXT("%.9g", shape->radius), "a cylinder must have a radius");
+        }
+        break;
+    case MPM_SHAPE_UNION:
+    case MPM_SHAPE_DIFFERENCE:
+    case MPM_SHAPE_INTERSECTION:
+        for (size_t k = 0; k < shape->n_children; k++) {
+            check_shape(r, &shape->children[k], TEXT("%s/%s/%zu", pointer, sets[shape->kind], k),
+                        dim);
+        }
+        break;
+    }
+}
+
+// ---- Bodies -------------------------------------------------------------------------------------
 
 struct outside {
     const struct mpm_def *def;
@@ -349,6 +490,8 @@ static void check_body(struct report *r, const struct mpm_def *def, size_t b, do
     }
 }
 
+// ---- Walls, loads, rigid bodies, probes, stages -------------------------------------------------
+
 static void check_wall(struct report *r, const struct mpm_def *def, const struct mpm_wall_def *w) {
     if (w->axis < 0 || w->axis >= def->dimension) {
         FAULT(r, MPM_ERR_RANGE, TEXT("/walls/%s/axis", w->name), "a direction of the scene",
@@ -369,15 +512,194 @@ static void check_wall(struct report *r, const struct mpm_def *def, const struct
     }
 }
 
+static void check_load(struct report *r, const struct mpm_def *def, const struct mpm_load_def *q) {
+    if (q->body < 0 || (size_t)q->body >= def->n_bodies) {
+        FAULT(r, MPM_ERR_REFERENCE, TEXT("/loads/%s/body", q->name), "a body", TEXT("%d", q->body),
+              "load '%s' names no body", q->name);
+    }
+    if (!q->has_box && (q->axis < 0 || q->axis >= def->dimension)) {
+        FAULT(r, MPM_ERR_RANGE, TEXT("/loads/%s/select/%s", q->name, q->round ? "axis" : "extreme"),
+              "a direction of the scene", TEXT("%d", q->axis),
+              "load '%s' has no axis of this scene", q->name);
+    }
+    if (q->has_box && q->is_pressure) {
+        FAULT(r, MPM_ERR_CONFLICT, TEXT("/loads/%s/pressure", q->name), "absent",
+              TEXT("%.9g", q->pressure),
+              "a pressure acts on a layer and not on a box; select an extreme");
+    }
+    for (int d = 0; d < def->dimension; d++) {
+        if (q->has_box && !(q->box_min[d] <= q->box_max[d])) {
+            FAULT(r, MPM_ERR_RANGE, TEXT("/loads/%s/select/box/max/%d", q->name, d),
+                  TEXT("at least %.9g m (min)", q->box_min[d]), TEXT("%.9g", q->box_max[d]),
+                  "the box of load '%s' is empty", q->name);
+        }
+        if (!q->is_pressure && !is_finite(q->force[d])) {
+            FAULT(r, MPM_ERR_RANGE, TEXT("/loads/%s/force/%d", q->name, d), "finite, N",
+                  TEXT("%.9g", q->force[d]), "the force of load '%s' must be finite", q->name);
+        }
+        if (q->round && !q->has_box && !is_finite(q->centre[d])) {
+            FAULT(r, MPM_ERR_RANGE, TEXT("/loads/%s/select/center/%d", q->name, d), "finite, m",
+                  TEXT("%.9g", q->centre[d]), "the centre of load '%s' must be finite", q->name);
+        }
+    }
+    if (q->is_pressure && !is_finite(q->pressure)) {
+        FAULT(r, MPM_ERR_RANGE, TEXT("/loads/%s/pressure", q->name), "finite, Pa",
+              TEXT("%.9g", q->pressure), "the pressure of load '%s' must be finite", q->name);
+    }
+    if (!(q->ramp >= 0 && is_finite(q->ramp))) {
+        FAULT(r, MPM_ERR_RANGE, TEXT("/loads/%s/ramp", q->name), "at least 0, s",
+              TEXT("%.9g", q->ramp), "the ramp of load '%s' must not be negative", q->name);
+    }
+}
+
+struct reach {
+    const struct mpm_def *def;
+    const struct mpm_load_def *load;
+    size_t in_box;
+    double least, most; // radius, m
+};
+
+static bool look_at_load(void *context, const double *x, double volume) {
+    (void)volume;
+    struct reach *o = context;
+    bool in = true;
+    double radius = 0;
+    for (int d = 0; d < o->def->dimension; d++) {
+        in &= x[d] >= o->load->box_min[d] && x[d] <= o->load->box_max[d];
+        if (o->def->dimension == 2 || d != o->load->axis) {
+            radius = hypot(radius, x[d] - o->load->centre[d]);
+        }
+    }
+    o->in_box += in;
+    o->least = fmin(o->least, radius);
+    o->most = fmax(o->most, radius);
+    return true;
+}
+
+// What the load finds among the particles of its body, which has some.
+static void check_load_particles(struct report *r, const struct mpm_def *def,
+                                 const struct mpm_load_def *q) {
+    const struct mpm_body_def *body = &def->bodies[q->body];
+    struct reach o = {.def = def, .load = q, .least = INFINITY};
+    if (!q->has_box && !(q->round && q->is_pressure)) {
+        return; // there always is an outermost particle
+    }
+    mpm_seed(def, body, look_at_load, &o);
+    if (q->has_box && o.in_box == 0) {
+        FAULT(r, MPM_ERR_EMPTY, TEXT("/loads/%s/select", q->name), "at least one particle", "0",
+              "load '%s' selects no particle of body '%s'", q->name, body->name);
+    }
+    // A pressure on a particle in the middle has no direction.
+    const double spacing = def->cell / body->particles_per_direction;
+    if (!q->has_box && o.least < spacing * NODE_PLANE_TOLERANCE &&
+        (!q->max_side || o.most < spacing)) {
+        FAULT(r, MPM_ERR_CONFLICT, TEXT("/loads/%s/select/center", q->name),
+              "off the particles that are loaded", "a particle at the centre",
+              "load '%s' presses on a particle at its centre, which has no direction", q->name);
+    }
+}
+
+static void check_rigid(struct report *r, const struct mpm_def *def,
+                        const struct mpm_rigid_def *q) {
+    const struct mpm_shape *shape = &q->shape;
+    if (!mpm_rigid_shape_is_known(shape)) {
+        FAULT(r, MPM_ERR_CONFLICT, TEXT("/rigid_bodies/%s/shape", q->name),
+              "a box, disk, sphere or polygon", "another shape",
+              "rigid body '%s' must be a box, disk, sphere or polygon", q->name);
+        return;
+    }
+    check_shape(r, shape, TEXT("/rigid_bodies/%s/shape", q->name), def->dimension);
+    for (int d = 0; d < def->dimension; d++) {
+        if (shape->kind == MPM_SHAPE_BOX &&
+            !(shape->max[d] > shape->min[d] && is_finite(shape->max[d] - shape->min[d]))) {
+            FAULT(r, MPM_ERR_RANGE, TEXT("/rigid_bodies/%s/shape/box/max/%d", q->name, d),
+                  TEXT("above %.9g m (min)", shape->min[d]), TEXT("%.9g", shape->max[d]),
+                  "the box of rigid body '%s' is empty", q->name);
+        }
+        if (shape->kind == MPM_SHAPE_BALL && !is_finite(shape->centre[d])) {
+            FAULT(r, MPM_ERR_RANGE,
+                  TEXT("/rigid_bodies/%s/shape/%s/center/%d", q->name,
+                       def->dimension == 2 ? "disk" : "sphere", d),
+                  "finite, m", TEXT("%.9g", shape->centre[d]),
+                  "the centre of rigid body '%s' must be finite", q->name);
+        }
+        if (!is_finite(q->velocity[d])) {
+            FAULT(r, MPM_ERR_RANGE, TEXT("/rigid_bodies/%s/velocity/%d", q->name, d), "finite, m/s",
+                  TEXT("%.9g", q->velocity[d]), "the velocity of rigid body '%s' must be finite",
+                  q->name);
+        }
+    }
+    if (shape->kind == MPM_SHAPE_BALL && !(shape->radius > 0 && is_finite(shape->radius))) {
+        FAULT(r, MPM_ERR_RANGE,
+              TEXT("/rigid_bodies/%s/shape/%s/radius", q->name,
+                   def->dimension == 2 ? "disk" : "sphere"),
+              "above 0, m", TEXT("%.9g", shape->radius), "rigid body '%s' must have a radius",
+              q->name);
+    }
+    if (!(q->stiffness > 0 && is_finite(q->stiffness))) {
+        FAULT(r, MPM_ERR_RANGE, TEXT("/rigid_bodies/%s/contact/stiffness", q->name), "above 0, Pa",
+              TEXT("%.9g", q->stiffness), "the contact of rigid body '%s' must have a stiffness",
+              q->name);
+    }
+    if (!(q->distance > 0 && q->distance < def->cell)) {
+        FAULT(r, MPM_ERR_RANGE, TEXT("/rigid_bodies/%s/contact/distance", q->name),
+              TEXT("above 0 and below %.9g m (cell)", def->cell), TEXT("%.9g", q->distance),
+              "the contact distance of rigid body '%s' must be above 0 and less than a cell",
+              q->name);
+    }
+    if (!(q->friction >= 0 && is_finite(q->friction))) {
+        FAULT(r, MPM_ERR_RANGE, TEXT("/rigid_bodies/%s/contact/friction", q->name), "at least 0",
+              TEXT("%.9g", q->friction), "the friction of rigid body '%s' must not be negative",
+              q->name);
+    }
+}
+
+struct intrusion {
+    const struct mpm_rigid_def *rigid;
+    int dim;
+    size_t inside;
+};
+
+static bool look_in_rigid(void *context, const double *x, double volume) {
+    (void)volume;
+    struct intrusion *o = context;
+    double normal[MPM_MAX_DIM];
+    o->inside += mpm_shape_distance(&o->rigid->shape, x, o->dim, normal) <= 0;
+    return true;
+}
+
+// No particle starts in a rigid body, or on its surface.
+static void check_rigid_place(struct report *r, const struct mpm_def *def, size_t k) {
+    const struct mpm_rigid_def *q = &def->rigids[k];
+    if (def->stages[0].removes_rigid && def->stages[0].removes_rigid[k]) {
+        return;
+    }
+    for (size_t b = 0; b < def->n_bodies; b++) {
+        const struct mpm_body_def *body = &def->bodies[b];
+        struct intrusion o = {.rigid = q, .dim = def->dimension};
+        if (boxes_meet(&q->shape, &body->shape, def->dimension)) {
+            mpm_seed(def, body, look_in_rigid, &o);
+        }
+        if (o.inside) {
+            FAULT(r, MPM_ERR_CONFLICT, TEXT("/rigid_bodies/%s/shape", q->name),
+                  TEXT("outside body '%s'", body->name), TEXT("%zu particles inside it", o.inside),
+                  "%zu particles of body '%s' lie inside rigid body '%s' or on its surface",
+                  o.inside, body->name, q->name);
+        }
+    }
+}
+
 static void check_probe(struct report *r, const struct mpm_def *def,
                         const struct mpm_probe_def *q) {
     if (q->body >= (int)def->n_bodies) {
         FAULT(r, MPM_ERR_REFERENCE, TEXT("/probes/%s/body", q->name), "a body", TEXT("%d", q->body),
               "probe '%s' names no body", q->name);
     }
-    if (q->kind == MPM_PROBE_REACTION && (q->wall < 0 || (size_t)q->wall >= def->n_walls)) {
-        FAULT(r, MPM_ERR_REFERENCE, TEXT("/probes/%s/wall", q->name), "a wall", TEXT("%d", q->wall),
-              "probe '%s' names no wall", q->name);
+    if (q->kind == MPM_PROBE_REACTION &&
+        (q->wall >= 0 ? (size_t)q->wall >= def->n_walls
+                      : q->rigid < 0 || (size_t)q->rigid >= def->n_rigids)) {
+        FAULT(r, MPM_ERR_REFERENCE, TEXT("/probes/%s/wall", q->name), "a wall or rigid body",
+              TEXT("%d", q->wall), "probe '%s' names no wall and no rigid body", q->name);
     }
     if (q->kind == MPM_PROBE_EXTENT && !(q->quantile > 0 && q->quantile <= 1)) {
         FAULT(r, MPM_ERR_RANGE, TEXT("/probes/%s/quantile", q->name), "above 0 and at most 1",
@@ -463,12 +785,28 @@ size_t mpm_check(const struct mpm_def *def,
     for (size_t k = 0; k < def->n_probes; k++) {
         check_probe(&r, def, &def->probes[k]);
     }
+    for (size_t b = 0; b < def->n_bodies; b++) {
+        const struct mpm_body_def *body = &def->bodies[b];
+        check_shape(&r, &body->shape, TEXT("/bodies/%s/shape", body->name), def->dimension);
+    }
+    for (size_t k = 0; k < def->n_loads; k++) {
+        check_load(&r, def, &def->loads[k]);
+    }
+    for (size_t k = 0; k < def->n_rigids; k++) {
+        check_rigid(&r, def, &def->rigids[k]);
+    }
     if (r.count) {
         return r.count; // what follows would divide by them
     }
     double total = 0;
     for (size_t b = 0; b < def->n_bodies && total < INFINITY; b++) {
         check_body(&r, def, b, &total);
+    }
+    for (size_t k = 0; k < def->n_loads && r.count == 0; k++) {
+        check_load_particles(&r, def, &def->loads[k]);
+    }
+    for (size_t k = 0; k < def->n_rigids && total < INFINITY; k++) {
+        check_rigid_place(&r, def, k);
     }
     if (r.count) {
         return r.count;

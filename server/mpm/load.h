@@ -7,6 +7,7 @@ struct mpm_load {
     bool active;
     size_t n;
     uint32_t *particle; // (n) index in the body, ascending
+    double *area;       // (n) m^2 that a pressure acts on; of a round one, per metre of radius now
     double *force;      // (n, dim) N, of this step
     double *x_before;   // (n, dim) m, for the work that it does
 };

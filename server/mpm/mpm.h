@@ -188,7 +188,20 @@ struct mpm_stage_def {
     unsigned resets;          // enum mpm_reset, done as the stage begins
     const bool *removes_wall; // (n_walls), or NULL
     const bool *removes_load; // (n_loads), or NULL
+    const bool *removes_rigid; // (n_rigids), or NULL
     const struct mpm_material_def *materials; // (n_materials) from this stage on, or NULL
+};
+
+// A rigid body that moves at a given velocity and touches every deformable body. Its pressure on a
+// particle closer than `distance` (d < D) to its surface is that of a barrier,
+// p(d) = stiffness [2 (d - D) ln(d/D) + (d - D)^2/d] / D, over the particle's area.
+struct mpm_rigid_def {
+    const char *name;
+    struct mpm_shape shape; // a box, ball or polygon
+    double velocity[MPM_MAX_DIM]; // m/s
+    double stiffness;             // Pa
+    double distance;              // m
+    double friction;              // coefficient
 };
 
 // A force on particles that stays with them. They are chosen in the reference configuration: those
@@ -211,7 +224,8 @@ struct mpm_probe_def {
     const char *name;
     enum mpm_probe_kind kind;
     int body;  // index, -1 = all
-    int wall;  // of a reaction
+    int wall;  // of a reaction, or -1: of `rigid`
+    int rigid;
     int field; // enum mpm_field
     int axis;
     bool max_side;   // of an extent
@@ -231,11 +245,12 @@ struct mpm_def {
     enum mpm_basis basis;
     struct mpm_settings settings;
     bool unstable_ok; // accept a dt above the stability limit
-    size_t n_materials, n_bodies, n_walls, n_loads, n_stages, n_probes;
+    size_t n_materials, n_bodies, n_walls, n_loads, n_rigids, n_stages, n_probes;
     const struct mpm_material_def *materials;
     const struct mpm_body_def *bodies;
     const struct mpm_wall_def *walls;
     const struct mpm_load_def *loads;
+    const struct mpm_rigid_def *rigids;
     const struct mpm_stage_def *stages; // at least one
     const struct mpm_probe_def *probes;
     bool wants_displacement; // a frame will ask for it
@@ -344,7 +359,7 @@ struct mpm_balance {
     double angular_momentum[MPM_MAX_DIM]; // kg m^2/s about the origin; in 2D only [2]
     double kinetic_energy, strain_energy; // J, strain energy of the deformation that stress uses
     double potential_energy;              // J, -m g x with the gravity in force
-    double external_work;                 // J, by gravity and moving walls since step 0
+    double external_work;                 // J, by gravity, loads, walls and rigid bodies since step 0
 };
 // Summed in a fixed order: the same bits for any number of threads.
 void mpm_balance(const struct mpm_sim *sim, struct mpm_balance *out);

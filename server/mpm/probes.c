@@ -181,7 +181,8 @@ static void present_value(struct mpm_sim *sim, size_t probe, double *out) {
                            (enum mpm_field)q->field, out);
         break;
     case MPM_PROBE_REACTION:
-        memcpy(out, sim->walls[q->wall].reaction, (size_t)sim->grid.dim * sizeof *out);
+        memcpy(out, q->wall >= 0 ? sim->walls[q->wall].reaction : sim->rigids[q->rigid].reaction,
+               (size_t)sim->grid.dim * sizeof *out);
         break;
     case MPM_PROBE_MAXIMUM:
     case MPM_PROBE_MINIMUM:

@@ -55,9 +55,19 @@ double mpm_dt_limit_at(double h, double wave_speed, double v_max, double nu, int
     return STABLE_CFL / ((wave_speed + v_max) / h + 2 * dim * nu / (h * h));
 }
 
+double mpm_largest_speed(const struct mpm_sim *sim) {
+    double largest = sqrt(sim->c.v2_max);
+    for (size_t k = 0; k < sim->n_rigids; k++) {
+        if (sim->rigids[k].active) {
+            largest = fmax(largest, mpm_rigid_speed(&sim->rigids[k].def, sim->grid.dim));
+        }
+    }
+    return largest;
+}
+
 double mpm_dt_limit(const struct mpm_sim *sim) {
-    return mpm_dt_limit_at(sim->grid.h, mpm_wave_speed(sim), sqrt(sim->c.v2_max), diffusivity(sim),
-                           sim->grid.dim);
+    return mpm_dt_limit_at(sim->grid.h, mpm_wave_speed(sim), mpm_largest_speed(sim),
+                           diffusivity(sim), sim->grid.dim);
 }
 
 double mpm_next_dt(const struct mpm_sim *sim) {
@@ -201,13 +211,19 @@ void mpm_enter_stage(struct mpm_sim *sim, size_t stage) {
     for (size_t k = 0; s->removes_load && k < sim->n_loads; k++) {
         sim->loads[k].active &= !s->removes_load[k];
     }
+    for (size_t k = 0; s->removes_rigid && k < sim->n_rigids; k++) {
+        sim->rigids[k].active &= !s->removes_rigid[k];
+        if (s->removes_rigid[k]) {
+            memset(sim->rigids[k].reaction, 0, sizeof sim->rigids[k].reaction);
+        }
+    }
+    reset(sim, s->resets); // before the patch, which may return the stress onto its yield surface
     if (s->materials) {
         mpm_restore_stage(sim);
         for (size_t b = 0; b < sim->n_sets; b++) {
             update_stress(&sim->sets[b]);
         }
     }
-    reset(sim, s->resets);
 }
 
 // ---- Create
@@ -386,17 +402,24 @@ enum mpm_status mpm_create(const struct mpm_def *def, struct mpm_sim **out, stru
     sim->sets = calloc(def->n_bodies, sizeof *sim->sets);
     sim->walls = calloc(def->n_walls + 1, sizeof *sim->walls);
     sim->loads = calloc(def->n_loads + 1, sizeof *sim->loads);
+    sim->rigids = calloc(def->n_rigids + 1, sizeof *sim->rigids);
     for (int d = 0; d < MPM_MAX_DIM; d++) {
         sim->c.min[d] = INFINITY;
         sim->c.max[d] = -INFINITY;
     }
-    if (!sim->sets || !sim->walls || !sim->loads || !mpm_grid_create(&sim->grid, def) ||
-        !create_sets(sim)) {
+    if (!sim->sets || !sim->walls || !sim->loads || !sim->rigids ||
+        !mpm_grid_create(&sim->grid, def) || !create_sets(sim)) {
         goto fail;
     }
     for (; sim->n_walls < def->n_walls; sim->n_walls++) {
         if (!mpm_wall_create(&sim->walls[sim->n_walls], &def->walls[sim->n_walls], &sim->grid,
                              def->basis, wants_reaction(def, sim->n_walls))) {
+            goto fail;
+        }
+    }
+    for (; sim->n_rigids < def->n_rigids; sim->n_rigids++) {
+        if (!mpm_rigid_create(&sim->rigids[sim->n_rigids], &def->rigids[sim->n_rigids],
+                              def->dimension, sim->n_particles)) {
             goto fail;
         }
     }
@@ -450,10 +473,14 @@ void mpm_free(struct mpm_sim *sim) {
     for (size_t k = 0; sim->loads && k < sim->n_loads; k++) {
         mpm_load_free(&sim->loads[k]);
     }
+    for (size_t k = 0; sim->rigids && k < sim->n_rigids; k++) {
+        mpm_rigid_free(&sim->rigids[k]);
+    }
     mpm_grid_free(&sim->grid);
     free(sim->sets);
     free(sim->walls);
     free(sim->loads);
+    free(sim->rigids);
     free(sim->results);
     free(sim->averages);
     free(sim->probe_set);
@@ -468,11 +495,15 @@ static size_t bytes_of(const struct mpm_def *def, const struct mpm_grid *grid, c
     const int scalars = mpm_fbar_scalars(widest_fbar(def));
     const int per_node =
         MPM_NODE(def->dimension) + MPM_VELOCITY(def->dimension) + (fbar ? 1 + scalars : 0);
-    size_t bytes = grid->n_nodes * (size_t)per_node * sizeof(double);
+    size_t bytes = grid->n_nodes * (size_t)per_node * sizeof(double), n_particles = 0;
     for (size_t b = 0; b < def->n_bodies; b++) {
+        n_particles += n[b];
         const struct mpm_material_def *m = &def->materials[def->bodies[b].material];
         bytes += mpm_particles_bytes(m->model, def->dimension, n[b], wants_x0(def),
                                      wants_J_raw(def), fbar && m->fbar);
+    }
+    for (size_t k = 0; k < def->n_rigids; k++) {
+        bytes += mpm_rigid_bytes(&def->rigids[k], def->dimension, n_particles);
     }
     return bytes;
 }
@@ -541,6 +572,9 @@ size_t mpm_bytes(const struct mpm_sim *sim) {
     size_t bytes = sim->grid.bytes;
     for (size_t b = 0; b < sim->n_sets; b++) {
         bytes += sim->sets[b].memory_bytes + sim->sets[b].fbar_bytes;
+    }
+    for (size_t k = 0; k < sim->n_rigids; k++) {
+        bytes += sim->rigids[k].anchor_bytes;
     }
     return bytes;
 }

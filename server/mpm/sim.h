@@ -1,6 +1,7 @@
 // The simulation's inside, shared by the files of the solver.
 #pragma once
 #include "server/mpm/boundary.h"
+#include "server/mpm/contact.h"
 #include "server/mpm/fbar.h"
 #include "server/mpm/load.h"
 #include "server/mpm/transfer.h"
@@ -38,10 +39,11 @@ struct mpm_sim {
     const struct mpm_kernels *kernels;
     struct mpm_grid grid;
     double exit_min[MPM_MAX_DIM], exit_max[MPM_MAX_DIM]; // m: a particle beyond them has left
-    size_t n_sets, n_walls, n_loads, n_particles, n_results;
+    size_t n_sets, n_walls, n_loads, n_rigids, n_particles, n_results;
     struct mpm_particles *sets; // one a body
     struct mpm_wall *walls;
     struct mpm_load *loads;
+    struct mpm_rigid *rigids;
     struct mpm_span_result *results; // one a chunk of the largest body
     struct mpm_average *averages;    // (n_probes), NULL where no probe averages
     size_t *probe_particle;          // (n_probes) set and particle of a probe at a point
@@ -62,6 +64,7 @@ void mpm_gravity_at(const struct mpm_sim *sim, double t, double *g);
 // Fastest P-wave of the present materials, m/s; and the limit on dt that it sets with particles
 // moving at v_max (m/s).
 double mpm_wave_speed(const struct mpm_sim *sim);
+double mpm_largest_speed(const struct mpm_sim *sim); // of particles and rigid bodies, m/s
 double mpm_dt_limit_at(double cell, double wave_speed, double v_max, double diffusivity, int dim);
 // The same for a stage of a definition, with the bodies' initial speeds.
 double mpm_def_dt_limit(const struct mpm_def *def, size_t stage);

@@ -75,10 +75,11 @@ MPM_KERNEL void mpm_from_eigen(const double *w, const double *Q, double *s) {
 // first term left out is below round-off of the first while |X| is below this.
 #define MPM_SERIES_REACH 0.02
 
-// atanh(r/m)/r for 0 <= r < m, with its limit 1/m.
-MPM_KERNEL double mpm_atanh_ratio(const double r, const double m) {
+// atanh(r/m)/r for 0 <= r < m, with its limit 1/m; log_det = ln(m^2 - r^2) is better known than m -
+// r where the eigenvalues lie far apart.
+MPM_KERNEL double mpm_atanh_ratio(const double r, const double m, const double log_det) {
     const double q = r / m;
-    return q < 1e-4 ? (1 + q * q / 3) / m : atanh(q) / r;
+    return q < 1e-4 ? (1 + q * q / 3) / m : q < 0.5 ? atanh(q) / r : (log(m + r) - log_det / 2) / r;
 }
 
 MPM_KERNEL void mpm_half_log(const double *b, double *e, const int dim) {
@@ -87,7 +88,8 @@ MPM_KERNEL void mpm_half_log(const double *b, double *e, const int dim) {
         const double m = 0.5 * (b[0] + b[1]), half = 0.5 * (b[0] - b[1]);
         const double r = sqrt(half * half + b[3] * b[3]);
         const double det = b[0] * b[1] - b[3] * b[3];
-        const double mean = 0.25 * log(det), f = 0.5 * mpm_atanh_ratio(r, m);
+        const double log_det = log(det), mean = 0.25 * log_det;
+        const double f = 0.5 * mpm_atanh_ratio(r, m, log_det);
         e[0] = mean + f * half;
         e[1] = mean - f * half;
         e[2] = 0.5 * log(b[2]);
@@ -136,10 +138,12 @@ MPM_KERNEL void mpm_exp_twice(const double *e, double *b, const int dim) {
         const double m = e[0] + e[1], half = e[0] - e[1], shear = 2 * e[3]; // of 2 e
         const double r = sqrt(half * half + shear * shear), scale = exp(m);
         const double s = r < 1e-4 ? 1 + r * r / 6 : sinh(r) / r, c = cosh(r);
-        b[0] = scale * (c + s * half);
-        b[1] = scale * (c - s * half);
         b[2] = exp(2 * e[2]);
         b[3] = scale * s * shear;
+        // The smaller diagonal entry from the determinant, scale^2: c - s |half| would cancel.
+        const int large = half < 0;
+        b[large] = scale * (c + s * fabs(half));
+        b[!large] = (scale * scale + b[3] * b[3]) / b[large];
         return;
     }
     double w[3], Q[9];

@@ -39,6 +39,14 @@ static void walk(struct mpm_sim *sim, visit *each, void *context) {
     for (size_t k = 0; k < sim->n_loads; k++) {
         each(context, &sim->loads[k].active, sizeof sim->loads[k].active);
     }
+    for (size_t k = 0; k < sim->n_rigids; k++) {
+        each(context, &sim->rigids[k].active, sizeof sim->rigids[k].active);
+        each(context, sim->rigids[k].offset, sizeof sim->rigids[k].offset);
+        each(context, sim->rigids[k].reaction, sizeof sim->rigids[k].reaction);
+        if (sim->rigids[k].anchor) {
+            each(context, sim->rigids[k].anchor, sim->rigids[k].anchor_bytes);
+        }
+    }
     if (sim->averages) {
         each(context, sim->averages, sim->def->n_probes * sizeof *sim->averages);
     }

@@ -162,6 +162,24 @@ static void advance_clock(struct mpm_sim *sim, double dt) {
     }
 }
 
+static void move_rigid_bodies(struct mpm_sim *sim, double dt, struct mpm_span_result *found) {
+    for (size_t k = 0; k < sim->n_rigids; k++) {
+        struct mpm_rigid *rigid = &sim->rigids[k];
+        if (!rigid->active) {
+            continue;
+        }
+        for (int d = 0; d < sim->grid.dim; d++) {
+            rigid->offset[d] += dt * rigid->def.velocity[d];
+        }
+        for (size_t b = 0; b < sim->n_sets; b++) {
+            mpm_contact_keep_out(rigid, &sim->sets[b], dt, found);
+        }
+        for (int d = 0; d < sim->grid.dim; d++) {
+            sim->c.external_work -= dt * rigid->reaction[d] * rigid->def.velocity[d];
+        }
+    }
+}
+
 static void leave_stage_if_over(struct mpm_sim *sim) {
     struct mpm_clockwork *c = &sim->c;
     if (c->stage + 1 == sim->def->n_stages) {
@@ -183,7 +201,7 @@ enum mpm_status mpm_step(struct mpm_sim *sim, struct mpm_error *err) {
     const struct mpm_settings *now = &sim->c.now;
     const int dim = sim->grid.dim;
     const double dt = mpm_next_dt(sim), time = sim->c.time + dt;
-    const double cfl = dt * (mpm_wave_speed(sim) + sqrt(sim->c.v2_max)) / sim->grid.h;
+    const double cfl = dt * (mpm_wave_speed(sim) + mpm_largest_speed(sim)) / sim->grid.h;
     if (cfl > UNSTABLE_CFL && !sim->def->unstable_ok) {
         return step_failure(sim, MPM_ERR_UNSTABLE_DT, time, -1, "CFL number", cfl, err);
     }
@@ -208,6 +226,13 @@ enum mpm_status mpm_step(struct mpm_sim *sim, struct mpm_error *err) {
             mpm_load_update(load, s, sim->c.time - mpm_start_time(sim));
             sim->kernels->force(&(struct mpm_span){.s = s, .grid = &sim->grid}, load->particle,
                                 load->force, load->n);
+        }
+    }
+    for (size_t k = 0; k < sim->n_rigids; k++) {
+        struct mpm_rigid *rigid = &sim->rigids[k];
+        memset(rigid->reaction, 0, sizeof rigid->reaction);
+        for (size_t b = 0; rigid->active && b < sim->n_sets; b++) {
+            mpm_contact_forces(rigid, sim->kernels, &sim->sets[b], &sim->grid, dt);
         }
     }
     charge(sim, MPM_PHASE_P2G, &clock);
@@ -259,7 +284,11 @@ enum mpm_status mpm_step(struct mpm_sim *sim, struct mpm_error *err) {
         charge(sim, MPM_PHASE_FBAR, &clock);
     }
 
-    const enum mpm_status status = check_result(sim, &found, time, err);
+    enum mpm_status status = check_result(sim, &found, time, err);
+    if (!status && sim->n_rigids > 0) {
+        move_rigid_bodies(sim, dt, &found);
+        status = check_result(sim, &found, time, err); // none was pushed out of the domain
+    }
     if (status) {
         return status;
     }

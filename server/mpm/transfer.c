@@ -265,6 +265,9 @@ MPM_KERNEL void g2p(const struct mpm_span *span, struct mpm_span_result *result,
             const double ratio = ratio_in_use(s, p, dim, kinematics);
             if (fbar) {
                 s->dJ[p] = 1 + dJ_minus_one;
+                if (kinematics == MPM_KEEPS_B && !(s->dJ[p] > 0)) { // sqrt(det b) would not tell
+                    fault(&r, p, MPM_ERR_VOLUME, s->dJ[p] * s->V[p] / s->V0[p]);
+                }
                 for (int d = 0; d < dim; d++) {
                     s->dx[mpm_at(p, dim, d)] = dx[p - begin][d];
                 }

@@ -12,20 +12,27 @@
 
 #include "server/mpm/sim.h"
 
-// A block of water or nearly incompressible rubber, dropped on the floor in a corner.
+#define N_KINDS 3
+
+// A block of nearly incompressible rubber, water or clay that flows, dropped on the floor in a
+// corner.
 static struct mpm_material_def material;
 static struct mpm_body_def body;
 static struct mpm_wall_def walls[2];
 static struct mpm_stage_def stage;
 static struct mpm_def def;
 
-static struct mpm_sim *create(int dim, int basis, int fluid) {
-    material = fluid ? (struct mpm_material_def){.name = "water",
-                                                 .model = mpm_material_find("newtonian"),
-                                                 .parameters = {1000, 1e6, 1}}
-                     : (struct mpm_material_def){.name = "rubber",
-                                                 .model = mpm_material_find("neo_hookean"),
-                                                 .parameters = {1000, 2e4, 0.495}};
+static struct mpm_sim *create(int dim, int basis, int kind) {
+    const struct mpm_material_def materials[N_KINDS] = {
+        {.name = "rubber",
+         .model = mpm_material_find("neo_hookean"),
+         .parameters = {1000, 2e4, 0.495}},
+        {.name = "water", .model = mpm_material_find("newtonian"), .parameters = {1000, 1e6, 1}},
+        {.name = "clay",
+         .model = mpm_material_find("hencky_j2"),
+         .parameters = {1000, 2e4, 0.495, 2000, 1000, 5}},
+    };
+    material = materials[kind];
     material.fbar = true;
     body = (struct mpm_body_def){.name = "block",
                                  .particles_per_direction = 2,
@@ -135,8 +142,8 @@ static void test_toggle_does_not_jump(void **state) {
     (void)state;
     for (int dim = 2; dim <= 3; dim++) {
         for (int basis = MPM_GIMP; basis <= MPM_BSPLINE3; basis++) {
-            for (int fluid = 0; fluid < 2; fluid++) {
-                struct mpm_sim *sim = create(dim, basis, fluid), *twin = create(dim, basis, fluid);
+            for (int kind = 0; kind < N_KINDS; kind++) {
+                struct mpm_sim *sim = create(dim, basis, kind), *twin = create(dim, basis, kind);
                 const double first = total_energy(sim);
                 const enum mpm_fbar_scheme order[] = {MPM_FBAR_ZHAO, MPM_FBAR_ANCHORED,
                                                       MPM_FBAR_OFF,  MPM_FBAR_ANCHORED,
@@ -160,8 +167,8 @@ static void test_toggle_does_not_jump(void **state) {
 // Switched back before a step is taken, nothing has happened.
 static void test_toggle_and_back_is_nothing(void **state) {
     (void)state;
-    for (int fluid = 0; fluid < 2; fluid++) {
-        struct mpm_sim *a = create(2, MPM_GIMP, fluid), *b = create(2, MPM_GIMP, fluid);
+    for (int kind = 0; kind < N_KINDS; kind++) {
+        struct mpm_sim *a = create(2, MPM_GIMP, kind), *b = create(2, MPM_GIMP, kind);
         for (int k = 0; k < 100; k++) {
             struct mpm_settings settings = mpm_settings_now(a);
             for (int scheme = MPM_N_FBAR_SCHEMES; scheme-- > 0;) { // ends with off

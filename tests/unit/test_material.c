@@ -12,6 +12,11 @@
 
 #include "server/mpm/particles.h"
 
+// Models that are elastic here, with the name of what they keep of the deformation.
+#define FOR_SOLIDS(dim, m)                                                                         \
+    for (int dim = 2; dim <= 3; dim++)                                                             \
+        for (int m = 0; m < 2; m++)
+
 static void near_at(double a, double b, double tol, int line) {
     if (!(fabs(a - b) <= tol)) {
         print_error("%.17g is not within %g of %.17g\n", a, tol, b);
@@ -30,18 +35,34 @@ static double uniform(void) { // in [-1, 1)
 #define NU 0.3
 #define LAMBDA (2 * MU * NU / (1 - 2 * NU))
 #define DENSITY 2.0
-static const double neo_hookean[] = {DENSITY, 2 * MU *(1 + NU), NU};
-static const double newtonian[] = {DENSITY, 100, 3}; // density, K, viscosity
+static const double neo_hookean[] = {DENSITY, 2 * MU *(1 + NU), NU, 0, 0, 0};
+static const double hencky[] = {DENSITY, 2 * MU *(1 + NU), NU, 1e9, 0, 0}; // never yields
+static const double hencky_soft[] = {DENSITY, 2 * MU *(1 + NU), NU, 0.1, 0.02, 3};
+static const char *const solids[] = {"neo_hookean", "hencky_j2"};
+static const double *const solid_parameters[] = {neo_hookean, hencky};
+static const double newtonian[] = {DENSITY, 100, 3, 0, 0, 0}; // density, K, viscosity
 
 static void create(struct mpm_particles *s, const char *model, const double *parameters, int dim,
                    size_t n) {
     *s = (struct mpm_particles){.material = mpm_material_find(model), .dim = dim};
-    memcpy(s->parameters, parameters, 3 * sizeof *parameters);
+    memcpy(s->parameters, parameters, 6 * sizeof *parameters);
     s->density = parameters[0];
     assert_true(mpm_particles_create(s, n, false, false));
 }
 
+// F, or b = F F^T where that is kept.
 static void put_F(struct mpm_particles *s, size_t p, const double *F) {
+    for (int k = 0; s->b && k < MPM_SYM(s->dim); k++) {
+        const int i = mpm_sym_row(k), j = mpm_sym_column(k);
+        double b = i >= s->dim; // out of plane
+        for (int d = 0; d < s->dim && i < s->dim; d++) {
+            b += F[i * s->dim + d] * F[j * s->dim + d];
+        }
+        s->b[mpm_at(p, MPM_SYM(s->dim), k)] = b;
+    }
+    if (!s->F) {
+        return;
+    }
     for (int k = 0; k < s->dim * s->dim; k++) {
         s->F[mpm_at(p, s->dim * s->dim, k)] = F[k];
     }
@@ -70,9 +91,9 @@ static void random_F(double *F, int dim) {
 static void test_material_stress_is_the_derivative_of_energy(void **state) {
     (void)state;
     const double e = 1e-5;
-    for (int dim = 2; dim <= 3; dim++) {
+    FOR_SOLIDS(dim, m) {
         struct mpm_particles s;
-        create(&s, "neo_hookean", neo_hookean, dim, 1);
+        create(&s, solids[m], solid_parameters[m], dim, 1);
         for (int trial = 0; trial < 50; trial++) {
             double F[9], P[9], sigma[9];
             random_F(F, dim);
@@ -82,6 +103,7 @@ static void test_material_stress_is_the_derivative_of_energy(void **state) {
                     memcpy(moved, F, sizeof moved);
                     moved[k] += side ? e : -e;
                     put_F(&s, 0, moved);
+                    s.material->stress[dim - 2](&s, 0, 1); // hencky_j2's energy is taken from it
                     W[side] = s.material->energy(&s, 0);
                 }
                 P[k] = (W[1] - W[0]) / (2 * e);
@@ -133,8 +155,11 @@ static void test_material_identity_has_no_stress(void **state) {
     const struct {
         const char *model;
         const double *parameters;
-    } cases[] = {{"neo_hookean", neo_hookean}, {"newtonian", newtonian}};
-    for (size_t c = 0; c < 2; c++) {
+    } cases[] = {{"neo_hookean", neo_hookean},
+                 {"newtonian", newtonian},
+                 {"hencky_j2", hencky},
+                 {"hencky_j2", hencky_soft}};
+    for (size_t c = 0; c < sizeof cases / sizeof *cases; c++) {
         for (int dim = 2; dim <= 3; dim++) {
             for (size_t n = 1; n <= 33; n++) { // whole and broken blocks and vectors
                 struct mpm_particles s;
@@ -196,9 +221,9 @@ static void multiply(const double *A, const double *B, double *out, int dim) {
 // sigma(Q F) = Q sigma(F) Q^T and W(Q F) = W(F): a few roundings of stresses of the size of 10.
 static void test_material_is_objective(void **state) {
     (void)state;
-    for (int dim = 2; dim <= 3; dim++) {
+    FOR_SOLIDS(dim, m) {
         struct mpm_particles s;
-        create(&s, "neo_hookean", neo_hookean, dim, 1);
+        create(&s, solids[m], solid_parameters[m], dim, 1);
         for (int trial = 0; trial < 50; trial++) {
             double F[9], Q[9], QF[9], before[9], after[9];
             random_F(F, dim);
@@ -230,9 +255,9 @@ static void test_material_is_objective(void **state) {
 // b = Q Q^T differs from 1 by a few eps, whatever the angle.
 static void test_material_rotation_has_no_stress(void **state) {
     (void)state;
-    for (int dim = 2; dim <= 3; dim++) {
+    FOR_SOLIDS(dim, m) {
         struct mpm_particles s;
-        create(&s, "neo_hookean", neo_hookean, dim, 1);
+        create(&s, solids[m], solid_parameters[m], dim, 1);
         for (int trial = 0; trial < 50; trial++) {
             double Q[9], sigma[9];
             rotation(Q, dim);
@@ -273,10 +298,10 @@ static void test_material_simple_shear_is_exact(void **state) {
 static void test_material_plane_strain_is_3d_with_F33_1(void **state) {
     (void)state;
     struct mpm_particles flat, solid;
-    create(&flat, "neo_hookean", neo_hookean, 2, 1);
-    create(&solid, "neo_hookean", neo_hookean, 3, 1);
-    for (int trial = 0; trial < 50; trial++) {
+    for (int trial = 0; trial < 100; trial++) {
         double F[9], a[9], b[9];
+        create(&flat, solids[trial % 2], solid_parameters[trial % 2], 2, 1);
+        create(&solid, solids[trial % 2], solid_parameters[trial % 2], 3, 1);
         random_F(F, 2);
         const double G[9] = {F[0], F[1], 0, F[2], F[3], 0, 0, 0, 1};
         put_F(&flat, 0, F);
@@ -287,27 +312,29 @@ static void test_material_plane_strain_is_3d_with_F33_1(void **state) {
             assert_near(a[k], b[k], 1e-14); // the same sums, rounded in another order
         }
         assert_near(flat.material->energy(&flat, 0), solid.material->energy(&solid, 0), 1e-14);
+        mpm_particles_free(&flat);
+        mpm_particles_free(&solid);
     }
-    mpm_particles_free(&flat);
-    mpm_particles_free(&solid);
 }
 
 // c = sqrt((lambda + 2 mu)/rho), which is also the slope of the stress in uniaxial strain.
 static void test_material_wave_speed_is_the_p_wave(void **state) {
     (void)state;
     struct mpm_particles s;
-    create(&s, "neo_hookean", neo_hookean, 3, 1);
-    const double c = s.material->wave_speed(s.parameters), e = 1e-6;
-    assert_near(c, sqrt((LAMBDA + 2 * MU) / DENSITY), 1e-15);
-    double F[9] = {1 + e, 0, 0, 0, 1, 0, 0, 0, 1}, plus[9], minus[9];
-    put_F(&s, 0, F);
-    stress(&s, 0, plus);
-    F[0] = 1 - e;
-    put_F(&s, 0, F);
-    stress(&s, 0, minus);
-    assert_near((plus[0] - minus[0]) / (2 * e) / DENSITY, c * c, 1e-9); // eps/e
-    assert_null(s.material->diffusivity);
-    mpm_particles_free(&s);
+    for (int m = 0; m < 2; m++) {
+        create(&s, solids[m], solid_parameters[m], 3, 1);
+        const double c = s.material->wave_speed(s.parameters), e = 1e-6;
+        assert_near(c, sqrt((LAMBDA + 2 * MU) / DENSITY), 1e-15);
+        double F[9] = {1 + e, 0, 0, 0, 1, 0, 0, 0, 1}, plus[9], minus[9];
+        put_F(&s, 0, F);
+        stress(&s, 0, plus);
+        F[0] = 1 - e;
+        put_F(&s, 0, F);
+        stress(&s, 0, minus);
+        assert_near((plus[0] - minus[0]) / (2 * e) / DENSITY, c * c, 1e-9); // eps/e
+        assert_null(s.material->diffusivity);
+        mpm_particles_free(&s);
+    }
 
     create(&s, "newtonian", newtonian, 3, 1);
     assert_near(s.material->wave_speed(s.parameters), sqrt(100 / DENSITY), 1e-15);
@@ -378,7 +405,7 @@ static void test_material_newtonian_rotation_has_no_stress(void **state) {
 
 static void test_material_list_is_complete(void **state) {
     (void)state;
-    assert_true(mpm_material_count() >= 2);
+    assert_true(mpm_material_count() >= 3);
     for (size_t k = 0; k < mpm_material_count(); k++) {
         const struct mpm_material *m = mpm_material_at(k);
         assert_ptr_equal(mpm_material_find(mpm_material_name(m)), m);

@@ -31,6 +31,11 @@ static const char base_text[] =
     "\"probes\":{\"front\":{\"kind\":\"extent\",\"axis\":\"x\"},\"energy\":{\"kind\":\"energy\"}},"
     "\"references\":[{\"probe\":\"front\",\"at\":\"end\",\"value\":3,\"tolerance\":0.1}]}";
 
+// A rigid body over the pool, and more keys of it.
+#define FOOT_CONTACT "\"contact\":{\"stiffness\":500,\"distance\":0.01}"
+#define FOOT_SHAPE "\"shape\":{\"box\":{\"min\":[0.5,1],\"max\":[1,2]}}"
+#define FOOT(more) "\"rigid_bodies\":{\"foot\":{" FOOT_SHAPE "," FOOT_CONTACT more "}}"
+
 static cJSON *parse(const char *text) {
     struct faults faults = {0};
     cJSON *json = json_parse(text, strlen(text), &faults);
@@ -270,8 +275,9 @@ static void test_scene_refuses_what_does_not_go_together(void **state) {
     assert_fault("{\"references\":[{\"probe\":\"energy\",\"component\":\"knetic\",\"at\":1,"
                  "\"value\":1,\"tolerance\":1}]}",
                  "/references/0/component", "choice");
-    assert_fault("{\"loads\":{\"push\":{}}}", "/loads", "unsupported");
-    assert_fault("{\"rigid_bodies\":{\"foot\":{}}}", "/rigid_bodies", "unsupported");
+    assert_fault("{\"probes\":{\"p\":{\"kind\":\"reaction\",\"wall\":\"floor\",\"rigid_body\":"
+                 "\"foot\"}}," FOOT("") "}",
+                 "/probes/p/rigid_body", "conflict");
     assert_fault("{\"bodies\":{\"pool\":{\"shape\":{\"disk\":{\"center\":[1,1],\"radius\":1}}}}}",
                  "/bodies/pool/shape", "count");
     assert_fault("{\"bodies\":{\"pool\":{\"shape\":{\"box\":null}}}}", "/bodies/pool/shape",
@@ -417,6 +423,391 @@ static void test_scene_passes_on_faults_of_the_solver(void **state) {
                  "/bodies/pool/shape", "memory");
     scene_free(create("{\"time\":{\"dt\":1},\"unstable_ok\":true}"));
     scene_free(create("{\"time\":{\"dt\":1,\"unstable_ok\":true}}"));
+}
+
+// ---- Shapes, loads and plasticity ---------------------------------------------------------------
+
+#define POLYGON(points) SHAPE("\"polygon\":{\"points\":" points "}")
+#define SHAPE(text) "{\"bodies\":{\"pool\":{\"shape\":{\"box\":null," text "}}}}"
+
+static void test_scene_refuses_polygons_that_are_not_simple(void **state) {
+    (void)state;
+    static const char points[] = "/bodies/pool/shape/polygon/points";
+    assert_fault(SHAPE("\"polygon\":[[0,0],[2,0],[2,1]]"), "/bodies/pool/shape/polygon", "type");
+    assert_fault(SHAPE("\"polygon\":{}"), points, "required");
+    assert_fault(POLYGON("3"), points, "type");
+    assert_fault(POLYGON("[[0,0],[2,0]]"), points, "count");
+    assert_fault(POLYGON("[[0,0],[2,0],[2]]"), "/bodies/pool/shape/polygon/points/2", "length");
+    assert_fault(POLYGON("[[0,0],[2,0],[2,\"1\"]]"), "/bodies/pool/shape/polygon/points/2/1",
+                 "type");
+    assert_fault(POLYGON("[[0,0],[1,1],[2,2]]"), points, "empty");
+    assert_fault(POLYGON("[[0,0],[2,1],[2,0],[0,1]]"), points, "empty"); // a bow tie, equal halves
+    assert_fault(POLYGON("[[0,0],[2,1],[2,0],[0,2]]"), points, "conflict");       // unequal ones
+    assert_fault(POLYGON("[[0,0],[2,0],[2,1],[0,1],[0,0]]"), points, "conflict"); // closed twice
+    assert_fault(POLYGON("[[0,0],[2,0],[2,0],[0,1]]"), points, "conflict");
+    // A spike that folds back; a corner on another edge; a corner twice.
+    assert_fault(POLYGON("[[0,0],[2,0],[2,1],[2,0.5],[0,1]]"), points, "conflict");
+    assert_fault(POLYGON("[[0,0],[2,0],[2,2],[1,0],[0,2]]"), points, "conflict");
+    assert_fault(POLYGON("[[0,0],[2,0],[1,1],[2,2],[0,2],[1,1]]"), points, "conflict");
+    assert_true(detail_has(POLYGON("[[0,0],[2,1],[2,0],[0,2]]"), "corner 0"));
+    assert_fault(SHAPE("\"union\":[{\"box\":{\"min\":[0,0],\"max\":[2,1]}},"
+                       "{\"difference\":[{\"polygon\":{\"points\":[[0,0],[2,1],[2,0],[0,2]]}}]}]"),
+                 "/bodies/pool/shape/union/1/difference/0/polygon/points", "conflict");
+    assert_fault(SHAPE("\"extrude\":{\"polygon\":[[0,0],[1,0],[1,1]],\"from\":0,\"to\":1}"),
+                 "/bodies/pool/shape/extrude", "dimension");
+    assert_fault(SHAPE("\"cylinder\":{\"from\":[0,0],\"to\":[1,0],\"radius\":1}"),
+                 "/bodies/pool/shape/cylinder", "dimension");
+}
+
+static size_t particles_of(const char *patch_text) {
+    struct scene *scene = create(patch_text);
+    struct mpm_estimate estimate;
+    mpm_estimate(scene_def(scene), &estimate);
+    scene_free(scene);
+    return estimate.particles;
+}
+
+// Spacing 0.25: the disk has 12 particles, the polygon what one counts by hand.
+static void test_scene_takes_polygons_either_way_round(void **state) {
+    (void)state;
+    size_t disk = particles_of("{\"bodies\":{\"pool\":null}}");
+    assert_int_equal(particles_of(POLYGON("[[0,0],[2,0],[2,1],[0,1]]")) - disk, 8 * 4);
+    assert_int_equal(particles_of(POLYGON("[[0,1],[2,1],[2,0],[0,0]]")) - disk, 8 * 4);
+    // Corners on a straight edge are fine.
+    assert_int_equal(particles_of(POLYGON("[[0,0],[1,0],[2,0],[2,1],[0,1]]")) - disk, 8 * 4);
+    // Below the diagonal of a square of 8 x 8, without and with the diagonal itself.
+    assert_int_equal(particles_of(POLYGON("[[0,0],[2,0],[2,2]]")) - disk, 8 * 7 / 2);
+    assert_int_equal(
+        particles_of("{\"bodies\":{\"pool\":{\"edge\":\"closed\",\"shape\":{\"box\":null,"
+                     "\"polygon\":{\"points\":[[0,0],[2,0],[2,2]]}}}}}") -
+            disk,
+        8 * 9 / 2);
+    // Inside set operations.
+    assert_int_equal(particles_of(SHAPE("\"difference\":[{\"box\":{\"min\":[0,0],\"max\":[2,2]}},"
+                                        "{\"polygon\":{\"points\":[[0,0],[2,0],[2,2]]}}]")) -
+                         disk,
+                     8 * 7 / 2); // neither half has its edge
+}
+
+// A cube of 2 m with a shape in it.
+static cJSON *solid_scene(const char *shape, const char *patch_text) {
+    char text[2000];
+    snprintf(text, sizeof text,
+             "{\"format\":\"fbard-scene-1\",\"dimension\":3,\"domain\":{\"min\":[0,0,0],"
+             "\"max\":[2,2,2]},\"cell\":0.5,\"time\":{\"end\":1},\"materials\":{\"m\":{\"model\":"
+             "\"neo_hookean\",\"density\":1,\"youngs_modulus\":10,\"poisson_ratio\":0}},"
+             "\"bodies\":{\"b\":{\"material\":\"m\",\"shape\":%s}}}",
+             shape);
+    cJSON *base = parse(text), *patch = parse(patch_text), *merged = json_merge_patch(base, patch);
+    cJSON_Delete(base);
+    cJSON_Delete(patch);
+    return merged;
+}
+
+static void assert_solid_fault(const char *shape, const char *patch_text, const char *pointer,
+                               const char *code) {
+    cJSON *json = solid_scene(shape, patch_text);
+    struct faults faults = {0};
+    assert_null(scene_create(json, &faults));
+    if (faults.count != 1 || !has_fault(&faults, pointer, code))
+        print_faults(&faults);
+    assert_int_equal(faults.count, 1);
+    assert_true(has_fault(&faults, pointer, code));
+    faults_free(&faults);
+    cJSON_Delete(json);
+}
+
+static size_t solid_particles(const char *shape) {
+    cJSON *json = solid_scene(shape, "{}");
+    struct faults faults = {0};
+    struct scene *scene = scene_create(json, &faults);
+    print_faults(&faults);
+    assert_non_null(scene);
+    struct mpm_estimate estimate;
+    mpm_estimate(scene_def(scene), &estimate);
+    scene_free(scene);
+    cJSON_Delete(json);
+    return estimate.particles;
+}
+
+static void test_scene_reads_extrusions_and_cylinders(void **state) {
+    (void)state;
+    static const char triangle[] =
+        "{\"extrude\":{\"polygon\":[[0,0],[2,0],[2,2]],\"from\":0.5,\"to\":1.5}}";
+    assert_int_equal(solid_particles(triangle), 28 * 4);
+    assert_int_equal(solid_particles("{\"extrude\":{\"polygon\":{\"points\":[[0,0],[2,0],[2,2]]},"
+                                     "\"from\":0.5,\"to\":1.5}}"),
+                     28 * 4);
+    cJSON *json = solid_scene(triangle, "{}");
+    struct faults faults = {0};
+    struct scene *scene = scene_create(json, &faults);
+    const struct mpm_shape *shape = &scene_def(scene)->bodies[0].shape;
+    assert_int_equal(shape->kind, MPM_SHAPE_EXTRUDE);
+    assert_true(shape->n_points == 3 && shape->points[4] == 2);
+    assert_true(shape->min[2] == 0.5 && shape->max[2] == 1.5);
+    scene_free(scene);
+    cJSON_Delete(json);
+    // 12 lattice points lie in a circle of 0.5 m about a cell's corner; 4 layers, or all 8.
+    assert_int_equal(
+        solid_particles("{\"cylinder\":{\"from\":[1,1,0.5],\"to\":[1,1,1.5],\"radius\":0.5}}"),
+        12 * 4);
+    assert_int_equal(
+        solid_particles("{\"cylinder\":{\"from\":[2,1,1],\"to\":[0,1,1],\"radius\":0.5}}"), 12 * 8);
+    assert_int_equal(
+        solid_particles("{\"difference\":[{\"box\":{\"min\":[0,0,0],\"max\":[2,2,2]}},"
+                        "{\"cylinder\":{\"from\":[1,1,0],\"to\":[1,1,2],\"radius\":0.5}}]}"),
+        (64 - 12) * 8);
+    static const char at[] = "/bodies/b/shape";
+    char pointer[80];
+    snprintf(pointer, sizeof pointer, "%s/polygon", at);
+    assert_solid_fault("{\"polygon\":{\"points\":[[0,0],[2,0],[2,2]]}}", "{}", pointer,
+                       "dimension");
+    snprintf(pointer, sizeof pointer, "%s/extrude/polygon", at);
+    assert_solid_fault("{\"extrude\":{\"polygon\":[[0,0],[2,1],[2,0],[0,2]],\"from\":0,\"to\":1}}",
+                       "{}", pointer, "conflict");
+    snprintf(pointer, sizeof pointer, "%s/extrude/to", at);
+    assert_solid_fault("{\"extrude\":{\"polygon\":[[0,0],[2,0],[2,2]],\"from\":1,\"to\":1}}", "{}",
+                       pointer, "range");
+    assert_solid_fault("{\"extrude\":{\"polygon\":[[0,0],[2,0],[2,2]],\"from\":1}}", "{}", pointer,
+                       "required");
+    snprintf(pointer, sizeof pointer, "%s/cylinder/to", at);
+    assert_solid_fault("{\"cylinder\":{\"from\":[1,1,1],\"to\":[1,1,1],\"radius\":0.5}}", "{}",
+                       pointer, "range");
+    snprintf(pointer, sizeof pointer, "%s/cylinder/radius", at);
+    assert_solid_fault("{\"cylinder\":{\"from\":[1,1,1],\"to\":[1,1,2],\"radius\":0}}", "{}",
+                       pointer, "range");
+}
+
+#define LOAD(text) "{\"loads\":{\"push\":{\"body\":\"ball\"," text "}}}"
+#define TOP "\"select\":{\"extreme\":\"+y\"},"
+
+static void test_scene_reads_loads(void **state) {
+    (void)state;
+    struct scene *scene =
+        create("{\"loads\":{\"a\":{\"body\":\"ball\"," TOP "\"force\":[1,-2],\"ramp\":0.5},"
+               "\"b\":{\"body\":\"pool\",\"select\":{\"box\":{\"min\":[0,0],\"max\":[1,1]}},"
+               "\"force\":[3,0]},"
+               "\"c\":{\"body\":\"ball\",\"select\":{\"extreme\":\"-r\",\"center\":[2,3]},"
+               "\"pressure\":7}},"
+               "\"stages\":[{\"name\":\"one\",\"duration\":1},"
+               "{\"name\":\"two\",\"remove\":{\"loads\":[\"c\",\"a\"],\"walls\":[\"left\"]}}]}");
+    const struct mpm_def *def = scene_def(scene);
+    const struct mpm_load_def *a = &def->loads[0], *b = &def->loads[1], *c = &def->loads[2];
+    assert_int_equal(def->n_loads, 3);
+    assert_string_equal(a->name, "a");
+    assert_true(a->body == 1 && a->axis == 1 && a->max_side && !a->round && !a->has_box);
+    assert_true(a->force[0] == 1 && a->force[1] == -2 && a->ramp == 0.5 && !a->is_pressure);
+    assert_true(b->body == 0 && b->has_box && b->box_max[1] == 1 && b->ramp == 0);
+    assert_true(c->round && !c->max_side && c->centre[1] == 3);
+    assert_true(c->is_pressure && c->pressure == 7);
+    assert_null(def->stages[0].removes_load);
+    const bool *removed = def->stages[1].removes_load;
+    assert_true(removed[0] && !removed[1] && removed[2]);
+    assert_true(def->stages[1].removes_wall[1]);
+    scene_free(scene);
+
+    cJSON *json = solid_scene("{\"cylinder\":{\"from\":[1,1,0.5],\"to\":[1,1,1.5],\"radius\":0.5}}",
+                              "{\"loads\":{\"p\":{\"body\":\"b\",\"select\":{\"extreme\":\"+r\","
+                              "\"center\":[1,1,0],\"axis\":\"z\"},\"pressure\":-1}}}");
+    struct faults faults = {0};
+    scene = scene_create(json, &faults);
+    print_faults(&faults);
+    assert_non_null(scene);
+    const struct mpm_load_def *p = scene_def(scene)->loads;
+    assert_true(p->round && p->max_side && p->axis == 2 && p->pressure == -1);
+    scene_free(scene);
+    cJSON_Delete(json);
+}
+
+static void test_scene_refuses_bad_loads(void **state) {
+    (void)state;
+    assert_fault("{\"loads\":{\"push\":{" TOP "\"force\":[0,1]}}}", "/loads/push/body", "required");
+    assert_fault("{\"loads\":{\"push\":{\"body\":\"bal\"," TOP "\"force\":[0,1]}}}",
+                 "/loads/push/body", "unknown_name");
+    assert_fault(LOAD("\"force\":[0,1]"), "/loads/push/select", "required");
+    assert_fault(LOAD("\"select\":{},\"force\":[0,1]"), "/loads/push/select", "required");
+    assert_fault(LOAD("\"select\":\"+x\",\"force\":[0,1]"), "/loads/push/select", "type");
+    assert_fault(LOAD(TOP "\"ramp\":1"), "/loads/push/force", "required");
+    assert_fault(LOAD(TOP "\"force\":[0,1],\"pressure\":1"), "/loads/push/pressure", "conflict");
+    assert_fault(LOAD(TOP "\"force\":[0,1,0]"), "/loads/push/force", "length");
+    assert_fault(LOAD(TOP "\"force\":5"), "/loads/push/force", "type");
+    assert_fault(LOAD(TOP "\"force\":[0,1],\"ramp\":-1"), "/loads/push/ramp", "range");
+    assert_fault(LOAD(TOP "\"force\":[0,1],\"stage\":1"), "/loads/push/stage", "unknown_key");
+    assert_fault(LOAD("\"select\":{\"extreme\":\"x\"},\"force\":[0,1]"),
+                 "/loads/push/select/extreme", "choice");
+    assert_fault(LOAD("\"select\":{\"extreme\":\"+z\"},\"force\":[0,1]"),
+                 "/loads/push/select/extreme", "dimension");
+    assert_fault(LOAD("\"select\":{\"extreme\":\"+r\"},\"pressure\":1"),
+                 "/loads/push/select/center", "required");
+    assert_fault(LOAD("\"select\":{\"extreme\":\"+y\",\"center\":[2,3]},\"pressure\":1"),
+                 "/loads/push/select/center", "conflict");
+    assert_fault(
+        LOAD("\"select\":{\"extreme\":\"+r\",\"center\":[2,3],\"axis\":\"y\"},\"pressure\":1"),
+        "/loads/push/select/axis", "dimension");
+#define BOXED "\"box\":{\"min\":[1.5,2.5],\"max\":[2.5,3.5]}"
+    assert_fault(LOAD("\"select\":{" BOXED ",\"extreme\":\"+y\"},\"force\":[0,1]"),
+                 "/loads/push/select/extreme", "conflict");
+    assert_fault(LOAD("\"select\":{" BOXED ",\"center\":[2,3]},\"force\":[0,1]"),
+                 "/loads/push/select/center", "conflict");
+    assert_fault(LOAD("\"select\":{" BOXED "},\"pressure\":1"), "/loads/push/pressure", "conflict");
+    // A box beside the body, and one between its particles.
+    assert_fault(LOAD("\"select\":{\"box\":{\"min\":[0,0],\"max\":[2,1]}},\"force\":[0,1]"),
+                 "/loads/push/select", "empty");
+    assert_fault(LOAD("\"select\":{\"box\":{\"min\":[1.9,2.9],\"max\":[2.1,3.1]}},\"force\":[0,1]"),
+                 "/loads/push/select", "empty");
+    // Pressing on a particle in the middle: in which direction?
+    assert_fault(LOAD("\"select\":{\"extreme\":\"-r\",\"center\":[1.875,2.875]},\"pressure\":1"),
+                 "/loads/push/select/center", "conflict");
+    scene_free(create(LOAD("\"select\":{" BOXED "},\"force\":[0,1]")));
+    assert_fault("{\"stages\":[{\"name\":\"a\",\"remove\":{\"loads\":[\"push\"]}}]}",
+                 "/stages/0/remove/loads/0", "unknown_name");
+    assert_solid_fault("{\"box\":{\"min\":[0,0,0],\"max\":[2,2,2]}}",
+                       "{\"loads\":{\"p\":{\"body\":\"b\",\"select\":{\"extreme\":\"+r\","
+                       "\"center\":[1,1,0]},\"pressure\":-1}}}",
+                       "/loads/p/select/axis", "required");
+}
+
+static void test_scene_reads_rigid_bodies(void **state) {
+    (void)state;
+    struct scene *scene = create("{" FOOT(
+        ",\"velocity\":[1,-2]") ",\"probes\":{"
+                                "\"push\":{\"kind\":\"reaction\",\"rigid_body\":\"foot\"},"
+                                "\"weight\":{\"kind\":\"reaction\",\"wall\":\"left\"}},"
+                                "\"references\":[{\"probe\":\"push\",\"component\":\"y\",\"at\":"
+                                "\"end\",\"value\":3,"
+                                "\"tolerance\":0.1}],"
+                                "\"stages\":[{\"name\":\"one\",\"duration\":1},"
+                                "{\"name\":\"two\",\"remove\":{\"rigid_bodies\":[\"foot\"]}}]}");
+    const struct mpm_def *def = scene_def(scene);
+    const struct mpm_rigid_def *foot = &def->rigids[0];
+    assert_int_equal(def->n_rigids, 1);
+    assert_string_equal(foot->name, "foot");
+    assert_int_equal(foot->shape.kind, MPM_SHAPE_BOX);
+    assert_true(foot->shape.min[0] == 0.5 && foot->shape.max[1] == 2);
+    assert_true(foot->velocity[0] == 1 && foot->velocity[1] == -2);
+    assert_true(foot->stiffness == 500 && foot->distance == 0.01 && foot->friction == 0);
+    assert_null(def->stages[0].removes_rigid);
+    assert_true(def->stages[1].removes_rigid[0]);
+    bool found[2] = {false};
+    for (size_t k = 0; k < def->n_probes; k++) {
+        const struct mpm_probe_def *q = &def->probes[k];
+        found[0] |= strcmp(q->name, "push") == 0 && q->wall == -1 && q->rigid == 0;
+        found[1] |= strcmp(q->name, "weight") == 0 && q->wall == 1;
+    }
+    assert_true(found[0] && found[1]);
+    scene_free(scene);
+    scene = create(
+        "{\"rigid_bodies\":{\"a\":{\"shape\":{\"disk\":{\"center\":[3,3],\"radius\":0.25}},"
+        "\"contact\":{\"kind\":\"barrier\",\"stiffness\":1,\"distance\":0.1,\"friction\":2}},"
+        "\"b\":{\"shape\":{\"polygon\":{\"points\":[[3,0],[4,0],[4,1]]}}," FOOT_CONTACT "}}}");
+    def = scene_def(scene);
+    assert_int_equal(def->n_rigids, 2);
+    assert_true(def->rigids[0].shape.kind == MPM_SHAPE_BALL && def->rigids[0].friction == 2);
+    assert_true(def->rigids[1].shape.kind == MPM_SHAPE_POLYGON);
+    assert_true(def->rigids[1].shape.n_points == 3 && def->rigids[1].velocity[1] == 0);
+    scene_free(scene);
+}
+
+#define RIGID(text) "{\"rigid_bodies\":{\"foot\":{" text "}}}"
+#define CONTACT(text) RIGID(FOOT_SHAPE ",\"contact\":{" text "}")
+
+static void test_scene_refuses_bad_rigid_bodies(void **state) {
+    (void)state;
+    assert_fault("{\"rigid_bodies\":[]}", "/rigid_bodies", "type");
+    assert_fault(RIGID(FOOT_CONTACT), "/rigid_bodies/foot/shape", "required");
+    assert_fault(RIGID(FOOT_SHAPE), "/rigid_bodies/foot/contact", "required");
+    assert_fault(CONTACT("\"distance\":0.01"), "/rigid_bodies/foot/contact/stiffness", "required");
+    assert_fault(CONTACT("\"stiffness\":1"), "/rigid_bodies/foot/contact/distance", "required");
+    assert_fault(CONTACT("\"stiffness\":0,\"distance\":0.01"),
+                 "/rigid_bodies/foot/contact/stiffness", "range");
+    assert_fault(CONTACT("\"stiffness\":1,\"distance\":0"), "/rigid_bodies/foot/contact/distance",
+                 "range");
+    assert_fault(CONTACT("\"stiffness\":1,\"distance\":0.5"), // a cell
+                 "/rigid_bodies/foot/contact/distance", "range");
+    assert_fault(CONTACT("\"stiffness\":1,\"distance\":0.1,\"friction\":-1"),
+                 "/rigid_bodies/foot/contact/friction", "range");
+    assert_fault(CONTACT("\"stiffness\":1,\"distance\":0.1,\"kind\":\"penalty\""),
+                 "/rigid_bodies/foot/contact/kind", "choice");
+    assert_fault(CONTACT("\"stiffness\":1,\"distance\":0.1,\"damping\":1"),
+                 "/rigid_bodies/foot/contact/damping", "unknown_key");
+    assert_fault("{" FOOT(",\"velocity\":[0,0,0]") "}", "/rigid_bodies/foot/velocity", "length");
+    assert_fault("{" FOOT(",\"mass\":1") "}", "/rigid_bodies/foot/mass", "unknown_key");
+    // Shapes: one of those whose distance is known.
+    assert_fault(
+        RIGID("\"shape\":{\"union\":[{\"box\":{\"min\":[0,2],\"max\":[1,3]}}]}," FOOT_CONTACT),
+        "/rigid_bodies/foot/shape/union", "unknown_key");
+    assert_fault(RIGID("\"shape\":{\"points\":[[0,0,1]]}," FOOT_CONTACT),
+                 "/rigid_bodies/foot/shape/points", "unknown_key");
+    assert_fault(RIGID("\"shape\":{\"sphere\":{\"center\":[3,3],\"radius\":0.25}}," FOOT_CONTACT),
+                 "/rigid_bodies/foot/shape/sphere", "dimension");
+    assert_fault(
+        RIGID("\"shape\":{\"polygon\":{\"points\":[[3,0],[4,1],[4,0],[3,1]]}}," FOOT_CONTACT),
+        "/rigid_bodies/foot/shape/polygon/points", "empty");
+    assert_fault(RIGID("\"shape\":{\"box\":{\"min\":[0,2],\"max\":[0,3]}}," FOOT_CONTACT),
+                 "/rigid_bodies/foot/shape/box/max/0", "range");
+    // It stands in the pool, or on its particles.
+#define AT(y) RIGID("\"shape\":{\"box\":{\"min\":[0.5," y "],\"max\":[1,2]}}," FOOT_CONTACT)
+    assert_fault(AT("0.5"), "/rigid_bodies/foot/shape", "conflict");
+    assert_true(detail_has(AT("0.5"), "4 particles of body 'pool'"));
+    assert_fault(AT("0.875"), "/rigid_bodies/foot/shape", "conflict");
+    scene_free(create(AT("0.8751")));
+    // Both or neither, and names.
+    assert_fault("{\"probes\":{\"p\":{\"kind\":\"energy\",\"rigid_body\":\"foot\"}}," FOOT("") "}",
+                 "/probes/p/rigid_body", "conflict");
+    assert_fault("{\"probes\":{\"p\":{\"kind\":\"reaction\",\"rigid_body\":\"fot\"}}," FOOT("") "}",
+                 "/probes/p/rigid_body", "unknown_name");
+    assert_fault("{\"stages\":[{\"name\":\"a\",\"remove\":{\"rigid_bodies\":[\"foot\"]}}]}",
+                 "/stages/0/remove/rigid_bodies/0", "unknown_name");
+    // Gone before the first step, it may be anywhere.
+    scene_free(create("{\"rigid_bodies\":{\"foot\":{\"shape\":{\"box\":{\"min\":[0.5,0.5],\"max\":["
+                      "1,2]}}," FOOT_CONTACT
+                      "}},\"stages\":[{\"name\":\"a\",\"remove\":{\"rigid_bodies\":"
+                      "[\"foot\"]}}]}"));
+}
+
+#define CLAY(more)                                                                                 \
+    "{\"materials\":{\"rubber\":{\"model\":\"hencky_j2\",\"yield_strength\":1000" more "}}}"
+
+static void test_scene_reads_plastic_materials(void **state) {
+    (void)state;
+    struct scene *scene = create(CLAY(""));
+    const double *par = scene_def(scene)->materials[1].parameters;
+    assert_true(par[3] == 1000 && par[4] == 0 && par[5] == 0); // perfect plasticity
+    scene_free(scene);
+    scene = create("{\"materials\":{\"rubber\":{\"model\":\"hencky_j2\",\"yield_strength\":1000,"
+                   "\"residual_strength\":100,\"softening\":5}},"
+                   "\"stages\":[{\"name\":\"a\",\"duration\":1},{\"name\":\"b\",\"reset\":["
+                   "\"plastic_strain\"],"
+                   "\"materials\":{\"rubber\":{\"yield_strength\":600}}}]}");
+    const struct mpm_stage_def *last = &scene_def(scene)->stages[1];
+    assert_true(last->materials[1].parameters[3] == 600);
+    assert_true(last->materials[1].parameters[4] == 100);
+    assert_int_equal(last->resets, MPM_RESET_PLASTIC_STRAIN);
+    scene_free(scene);
+    assert_fault("{\"materials\":{\"rubber\":{\"model\":\"hencky_j2\"}}}",
+                 "/materials/rubber/yield_strength", "required");
+    assert_fault("{\"materials\":{\"rubber\":{\"model\":\"hencky_j2\",\"yield_strength\":0}}}",
+                 "/materials/rubber/yield_strength", "range");
+    assert_fault(CLAY(",\"residual_strength\":1001"), "/materials/rubber/residual_strength",
+                 "conflict");
+    // 3 mu = 115 kPa over a fall of 900 Pa: 128.
+    assert_fault(CLAY(",\"residual_strength\":100,\"softening\":130"),
+                 "/materials/rubber/softening", "conflict");
+    assert_fault(
+        "{\"materials\":{\"rubber\":{\"model\":\"hencky_j2\",\"yield_strength\":1000,"
+        "\"residual_strength\":500}},"
+        "\"stages\":[{\"name\":\"a\",\"materials\":{\"rubber\":{\"yield_strength\":400}}}]}",
+        "/stages/0/materials/rubber/residual_strength", "conflict");
+    static const char *const fixed[][2] = {
+        {"density", "1"}, {"model", "\"newtonian\""}, {"fbar", "false"}};
+    for (size_t i = 0; i < COUNT(fixed); i++) {
+        char patch[200], pointer[80];
+        snprintf(patch, sizeof patch,
+                 "{\"stages\":[{\"name\":\"a\",\"materials\":{\"rubber\":{\"%s\":%s}}}]}",
+                 fixed[i][0], fixed[i][1]);
+        snprintf(pointer, sizeof pointer, "/stages/0/materials/rubber/%s", fixed[i][0]);
+        assert_fault(patch, pointer, "immutable");
+    }
 }
 
 // ---- The definition -----------------------------------------------------------------------------
@@ -822,6 +1213,51 @@ static void test_dam_break_takes_a_softer_fluid(void **state) {
     cJSON_Delete(merged);
 }
 
+// The counts that the paper gives, at its two resolutions.
+static void test_paper_scenes_have_the_particles_of_the_paper(void **state) {
+    (void)state;
+    static const struct {
+        const char *name, *patch;
+        size_t particles;
+    } scenes[] = {{"cook-membrane", "{}", 5776},   {"cook-membrane", "{\"cell\":0.5}", 23072},
+                  {"strip-footing", "{}", 230400}, {"strip-footing-small", "{}", 24000},
+                  {"landslide-slice", "{}", 6225}, {"landslide", "{}", 311250}};
+    for (size_t i = 0; i < COUNT(scenes); i++) {
+        cJSON *json = scene_builtin(scenes[i].name), *patch = parse(scenes[i].patch);
+        cJSON *merged = json_merge_patch(json, patch);
+        struct faults faults = {0};
+        struct scene *scene = scene_create(merged, &faults);
+        print_faults(&faults);
+        assert_non_null(scene);
+        struct mpm_estimate estimate;
+        mpm_estimate(scene_def(scene), &estimate);
+        assert_int_equal(estimate.particles, scenes[i].particles);
+        scene_free(scene);
+        cJSON_Delete(merged);
+        cJSON_Delete(patch);
+        cJSON_Delete(json);
+    }
+}
+
+// Every file can be stepped.
+static void test_builtin_scenes_make_three_steps(void **state) {
+    (void)state;
+    for (size_t i = 0; i < scene_builtin_count(); i++) {
+        cJSON *json = scene_builtin(scene_builtin_name(i));
+        struct faults faults = {0};
+        struct scene *scene = scene_create(json, &faults);
+        struct mpm_sim *sim;
+        struct mpm_error error;
+        assert_int_equal(mpm_create(scene_def(scene), &sim, &error), MPM_OK);
+        for (int k = 0; k < 3; k++)
+            if (mpm_step(sim, &error))
+                fail_msg("%s: %s", scene_builtin_name(i), error.message);
+        mpm_free(sim);
+        scene_free(scene);
+        cJSON_Delete(json);
+    }
+}
+
 // Every key of the table is somewhere in the schema's text as a property.
 static void assert_schema_names(const char *schema, const struct scene_value *value, int depth) {
     for (const struct scene_key *key = value->keys; key && key->name; key++) {
@@ -926,6 +1362,14 @@ int main(int argc, char **argv) {
         cmocka_unit_test(test_scene_reports_all_faults),
         cmocka_unit_test(test_scene_that_is_no_object_is_refused),
         cmocka_unit_test(test_scene_passes_on_faults_of_the_solver),
+        cmocka_unit_test(test_scene_refuses_polygons_that_are_not_simple),
+        cmocka_unit_test(test_scene_takes_polygons_either_way_round),
+        cmocka_unit_test(test_scene_reads_extrusions_and_cylinders),
+        cmocka_unit_test(test_scene_reads_loads),
+        cmocka_unit_test(test_scene_refuses_bad_loads),
+        cmocka_unit_test(test_scene_reads_rigid_bodies),
+        cmocka_unit_test(test_scene_refuses_bad_rigid_bodies),
+        cmocka_unit_test(test_scene_reads_plastic_materials),
         cmocka_unit_test(test_scene_definition_follows_the_scene),
         cmocka_unit_test(test_scene_stages_state_settings_and_keep_changes),
         cmocka_unit_test(test_scene_in_three_dimensions),
@@ -939,6 +1383,8 @@ int main(int argc, char **argv) {
         cmocka_unit_test(test_config_json_can_be_patched_back),
         cmocka_unit_test(test_builtin_scenes_are_valid),
         cmocka_unit_test(test_dam_break_takes_a_softer_fluid),
+        cmocka_unit_test(test_paper_scenes_have_the_particles_of_the_paper),
+        cmocka_unit_test(test_builtin_scenes_make_three_steps),
         cmocka_unit_test(test_schema_covers_the_table),
         cmocka_unit_test(test_materials_are_listed),
         cmocka_unit_test(test_documentation_follows_the_table),

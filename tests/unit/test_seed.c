@@ -313,6 +313,195 @@ static void test_seed_bound_is_close(void **state) {
     assert_true(mpm_seed_bound(&def, &body) >= n && mpm_seed_bound(&def, &body) < 2 * n);
 }
 
+// ---- Polygons, extrusions, cylinders
+// -------------------------------------------------------------
+
+static struct mpm_shape polygon(const double *points, size_t n) {
+    return (struct mpm_shape){.kind = MPM_SHAPE_POLYGON, .n_points = n, .points = points};
+}
+
+// The same outline run through the other way, and from another vertex.
+static void turned(const double *points, size_t n, size_t from, bool back, double *out) {
+    for (size_t k = 0; k < n; k++) {
+        const size_t j = (from + (back ? n - k : k)) % n;
+        memcpy(out + 2 * k, points + 2 * j, 2 * sizeof *out);
+    }
+}
+
+// Every orientation and first vertex of an outline gives this count.
+static void assert_counts(const struct mpm_def *def, const double *points, size_t n_points, int n,
+                          size_t open, size_t closed) {
+    double list[32];
+    for (size_t from = 0; from < n_points; from++) {
+        for (int back = 0; back < 2; back++) {
+            turned(points, n_points, from, back, list);
+            const struct mpm_shape shape = polygon(list, n_points);
+            assert_int_equal(count(def, &shape, n, false), open);
+            assert_int_equal(count(def, &shape, n, true), closed);
+        }
+    }
+}
+
+// Cook's membrane, the paper's 5,776 and 23,072 with the slanted edges' own points. How many points
+// lie on those edges is counted here in whole numbers: 44 x = 48 y, 16 x = 48 (y - 44).
+static void test_seed_cook_has_the_papers_counts(void **state) {
+    (void)state;
+    const double cook[] = {0, 0, 48, 44, 48, 60, 0, 44};
+    const double corners[][3] = {{0, 0}, {0, -4}, {-1.5, -7}, {-100, -1000}};
+    for (int k = 0; k < 2; k++) {
+        const double h = k ? 0.5 : 1;
+        const int per_metre = k ? 8 : 4; // half spacings
+        int open = 0, closed = 0;
+        for (int i = 1; i < 48 * per_metre; i += 2) {
+            for (int j = 1; j < 64 * per_metre; j += 2) {
+                const int below = 44 * i - 48 * j, above = 48 * (j - 44 * per_metre) - 16 * i;
+                closed += below <= 0 && above <= 0;
+                open += below < 0 && above < 0;
+            }
+        }
+        assert_int_equal(closed, k ? 23072 : 5776);
+        assert_true(open < closed);
+        for (size_t c = 0; c < 4; c++) {
+            struct mpm_def def = domain(2, h, corners[c]);
+            assert_counts(&def, cook, 4, 2, (size_t)open, (size_t)closed);
+        }
+    }
+    // In another unit, in which the vertices are not exact: the same.
+    double small[8];
+    for (int k = 0; k < 8; k++) {
+        small[k] = 1e-3 * cook[k];
+    }
+    const struct mpm_def def = domain(2, 1e-3, zero);
+    const struct mpm_shape shape = polygon(small, 4);
+    assert_int_equal(count(&def, &shape, 2, true), 5776);
+}
+
+// The landslide: base 15 m, height 5 m, crest 10 m, 5 m thick, at 0.1 m: 50 columns deep, and the
+// face at 45 degrees goes through lattice points, which lie not strictly inside.
+static void test_seed_landslide_has_the_papers_count(void **state) {
+    (void)state;
+    const double outline[] = {0, 0, 15, 0, 10, 5, 0, 5};
+    struct mpm_shape shape = {
+        .kind = MPM_SHAPE_EXTRUDE, .n_points = 4, .points = outline, .max = {0, 0, 5}};
+    const struct mpm_def def = domain(3, 0.2, zero);
+    assert_int_equal(count(&def, &shape, 2, false), 311250);
+    assert_int_equal(count(&def, &shape, 2, true), 311250 + 50 * 50);
+    const struct mpm_def flat = domain(2, 0.2, zero);
+    assert_counts(&flat, outline, 4, 2, 6225, 6225 + 50);
+    // Ends of the extrusion through lattice points.
+    shape.min[2] = 0.05;
+    shape.max[2] = 0.25;
+    assert_int_equal(count(&def, &shape, 2, false), 6225);
+    assert_int_equal(count(&def, &shape, 2, true), 3 * (6225 + 50));
+}
+
+// An L, a comb and a star's notch: what a ray meets several times.
+static void test_seed_polygons_need_not_be_convex(void **state) {
+    (void)state;
+    const struct mpm_def def = domain(2, 1, zero);
+    const double ell[] = {1, 1, 6, 1, 6, 3, 3, 3, 3, 6, 1, 6};
+    assert_counts(&def, ell, 6, 2, 4 * (10 + 6), 4 * (10 + 6));
+    const double comb[] = {0, 0, 7, 0, 7, 4, 6, 4, 6, 1, 5, 1, 5, 4, 4, 4,
+                           4, 1, 3, 1, 3, 4, 2, 4, 2, 1, 1, 1, 1, 4, 0, 4};
+    assert_counts(&def, comb, 16, 3, 9 * (7 + 4 * 3), 9 * (7 + 4 * 3));
+    // A notch down to (4, 2.875) whose edges go through lattice points: above 2.875 + 2 abs(x - 4).
+    const double notch[] = {0, 0, 8, 0, 8, 8, 6.5625, 8, 4, 2.875, 1.4375, 8, 0, 8};
+    int open = 0, closed = 0;
+    for (int i = 0; i < 32; i++) {
+        for (int j = 0; j < 32; j++) {
+            const double x = 0.125 + 0.25 * i, y = 0.125 + 0.25 * j;
+            const double over = y - (2.875 + 2 * fabs(x - 4)); // exact
+            open += over < 0;
+            closed += over <= 0;
+        }
+    }
+    assert_counts(&def, notch, 7, 4, (size_t)open, (size_t)closed);
+    assert_true(closed > open);
+}
+
+// Vertices on lattice points, edges along rows of them, and a tip that touches one.
+static void test_seed_polygon_vertices_on_lattice_points(void **state) {
+    (void)state;
+    const struct mpm_def def = domain(2, 0.2, zero); // points at 0.05 + 0.1 k
+    const double square[] = {0.25, 0.25, 0.65, 0.25, 0.65, 0.45, 0.25, 0.45};
+    assert_counts(&def, square, 4, 2, 3 * 1, 5 * 3);
+    const double wedge[] = {0.25, 0.25, 1.05, 0.25, 0.65, 0.65}; // 45 degrees: Pick's theorem
+    assert_counts(&def, wedge, 3, 2, 9, 25);
+    const double diamond[] = {0.65, 0.25, 1.05, 0.65, 0.65, 1.05, 0.25, 0.65};
+    assert_counts(&def, diamond, 4, 2, 25, 41);
+    // A vertex in the middle of an edge changes nothing.
+    const double more[] = {0.25, 0.25, 0.45, 0.25, 0.65, 0.25, 0.65, 0.45, 0.25, 0.45};
+    assert_counts(&def, more, 5, 2, 3 * 1, 5 * 3);
+    // One round-off to any side changes nothing.
+    double moved[8];
+    for (int k = 0; k < 8; k++) {
+        moved[k] = nextafter(square[k], k % 3 ? 0 : 1);
+    }
+    assert_counts(&def, moved, 4, 2, 3 * 1, 5 * 3);
+}
+
+static void test_seed_polygon_contains_and_bounds(void **state) {
+    (void)state;
+    const double wedge[] = {-1, -2, 3, -2, -1, 4};
+    const struct mpm_shape shape = polygon(wedge, 3);
+    double min[3], max[3];
+    assert_true(mpm_shape_bounds(&shape, 2, min, max));
+    assert_true(min[0] == -1 && min[1] == -2 && max[0] == 3 && max[1] == 4);
+    const double inside[] = {-0.5, 2}, beyond[] = {2, 3}, edge[] = {1, 1};
+    assert_true(mpm_shape_contains(&shape, inside, 2, 0.01));
+    assert_false(mpm_shape_contains(&shape, beyond, 2, 0.01));
+    assert_false(mpm_shape_contains(&shape, edge, 2, 0.01));
+}
+
+// A cylinder along any direction has its volume, up to half a spacing of its surface; along an axis
+// it is the disk of its circle times the layers.
+static void test_seed_cylinder_has_its_volume(void **state) {
+    (void)state;
+    const struct mpm_def flat = domain(2, 0.1, zero), def = domain(3, 0.1, zero);
+    const struct mpm_shape disk = {
+        .kind = MPM_SHAPE_BALL, .centre = {0.51, 0.48, 0.5}, .radius = 0.3};
+    const double along[][3] = {{0, 0, 0.4}, {0, 0, -0.4}, {0.3, 0.2, 0.3}, {-0.4, 0.1, 0.2}};
+    for (int n = 2; n <= 5; n++) {
+        struct mpm_shape shape = {.kind = MPM_SHAPE_CYLINDER, .radius = 0.3};
+        const double spacing = 0.1 / n;
+        for (int axis = 0; axis < 3; axis++) {
+            for (int d = 0; d < 3; d++) {
+                shape.min[d] = shape.max[d] = d == axis ? 0.2 : d == (axis + 1) % 3 ? 0.51 : 0.48;
+            }
+            shape.max[axis] = 0.6;
+            assert_int_equal(count(&def, &shape, n, false),
+                             count(&flat, &disk, n, false) * (size_t)(4 * n));
+        }
+        for (int k = 0; k < 4; k++) {
+            double length = 0;
+            for (int d = 0; d < 3; d++) {
+                shape.min[d] = 0.5 - along[k][d] / 2;
+                shape.max[d] = 0.5 + along[k][d] / 2;
+                length += along[k][d] * along[k][d];
+            }
+            length = sqrt(length);
+            const double surface = 2 * M_PI * 0.3 * (length + 0.3);
+            assert_near((double)count(&def, &shape, n, false) * pow(spacing, 3),
+                        M_PI * 0.09 * length, surface * spacing / 2);
+            double min[3], max[3];
+            assert_true(mpm_shape_bounds(&shape, 3, min, max));
+            for (int d = 0; d < 3; d++) { // the rim's highest points
+                const double reach = 0.3 * sqrt(1 - pow(along[k][d] / length, 2));
+                assert_near(max[d], 0.5 + fabs(along[k][d]) / 2 + reach, 1e-15);
+                assert_near(min[d], 0.5 - fabs(along[k][d]) / 2 - reach, 1e-15);
+            }
+        }
+    }
+    // Ends and surface through lattice points: 3-4-5 again, 3 open or 5 closed layers.
+    const struct mpm_def coarse = domain(3, 0.2, zero);
+    const struct mpm_shape edge = {.kind = MPM_SHAPE_CYLINDER,
+                                   .min = {1.05, 1.05, 0.25},
+                                   .max = {1.05, 1.05, 0.65},
+                                   .radius = 0.5};
+    assert_int_equal(count(&coarse, &edge, 2, true), 5 * 81);
+    assert_int_equal(count(&coarse, &edge, 2, false), 3 * 69);
+}
+
 int main(int argc, char **argv) {
     feenableexcept(FE_DIVBYZERO | FE_INVALID | FE_OVERFLOW);
     const struct CMUnitTest tests[] = {
@@ -330,6 +519,12 @@ int main(int argc, char **argv) {
         cmocka_unit_test(test_seed_shape_contains_a_point),
         cmocka_unit_test(test_seed_velocity_fields),
         cmocka_unit_test(test_seed_bound_is_close),
+        cmocka_unit_test(test_seed_cook_has_the_papers_counts),
+        cmocka_unit_test(test_seed_landslide_has_the_papers_count),
+        cmocka_unit_test(test_seed_polygons_need_not_be_convex),
+        cmocka_unit_test(test_seed_polygon_vertices_on_lattice_points),
+        cmocka_unit_test(test_seed_polygon_contains_and_bounds),
+        cmocka_unit_test(test_seed_cylinder_has_its_volume),
     };
     cmocka_set_test_filter(argc > 1 ? argv[1] : NULL);
     return cmocka_run_group_tests(tests, NULL, NULL);

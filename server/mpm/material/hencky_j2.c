@@ -95,13 +95,13 @@ static double plastic_multiplier(const double *par, double norm, double a, doubl
     const double root = sqrt(2.0 / 3), two_mu = 2 * shear_modulus(par);
     const double residual = residual_strength(par), fall = par[YIELD_STRENGTH] - residual;
     double x = 0;
-    for (int k = 0; k < 50; k++) { // quadratic: 2 to 5 in practice, 1 where nothing softens
+    for (int k = 0; k < 50; k++) { // quadratic: 2 where nothing softens, else 3 or 4 in practice
         const double soft = fall * exp(-par[SOFTENING] * (a + root * x));
         *radius = root * (residual + soft);
         const double step =
             (norm - two_mu * x - *radius) / (two_mu - 2.0 / 3 * par[SOFTENING] * soft);
         x += step;
-        if (fabs(step) <= 4 * DBL_EPSILON * x) {
+        if (fabs(step) <= 4 * DBL_EPSILON * norm / two_mu) { // round-off of the residual
             break;
         }
     }
