@@ -187,6 +187,12 @@ static void reply_frame(struct call *c, struct run *run) {
                       text, c->names[0]);
         return;
     }
+    struct run *listed = fd < 0 ? runs_find(c->routes->runs, c->names[0]) : NULL;
+    run_release(listed);
+    if (fd < 0 && listed != run) {
+        reply_problem(c->reply, 404, NULL, "there is no run %.80s any more", c->names[0]);
+        return;
+    }
     if (fd < 0) {
         log_error("frame", "run=%s why=\"%s\"", c->names[0], why);
         reply_problem(c->reply, 500, NULL, "%s", why);

@@ -341,7 +341,12 @@ struct run *run_create(const struct run_host *host, const struct run_definition 
     if (r->journal == NULL)
         goto fail;
     journal_budget(r->journal, (uint64_t)r->config.output.journal_bytes);
-    if (journal_append_event(r->journal, event, why) != JOURNAL_OK || !begin_thread(r)) {
+    bool made = journal_append_event(r->journal, event, why) == JOURNAL_OK;
+    if (made && definition->start) // here and not in its thread, so that first come is first served
+        slots_ask(host->slots, &r->slot, r->sim_bytes);
+    if (!made || !begin_thread(r)) {
+        slots_leave(host->slots, &r->slot);
+        slots_unreserve(host->slots, &r->slot);
         journal_remove(host->data_dir, r->id, NULL);
         goto fail;
     }

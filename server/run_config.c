@@ -102,6 +102,10 @@ enum run_outcome run_configure(struct run *r, struct run_command *c) {
             return RUN_INVALID;
         }
     }
+    if (r->sim != NULL) { // the copy for readers may be some steps old; the log must not be
+        r->now.step = mpm_step_count(r->sim);
+        r->now.time = mpm_time(r->sim);
+    }
     cJSON *event = history_event("config", &r->now);
     cJSON_AddItemToObject(event, "patch", cJSON_Duplicate(c->patch, true));
     cJSON_AddNumberToObject(event, "frames", (double)r->next_seq);

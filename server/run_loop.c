@@ -349,6 +349,8 @@ static void advance(struct run *r) {
         pause_run(r);
         return;
     }
+    if (!r->has_checkpoint && mpm_step_count(r->sim) == 0)
+        run_checkpoint(r, why); // so that one is there however early the run fails
     if (mpm_step(r->sim, &error) != MPM_OK) {
         run_fail_with(r, &error);
         return;

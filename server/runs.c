@@ -221,16 +221,21 @@ enum runs_removal runs_remove(struct runs *s, const char *id, enum run_state *st
         if (!run_state_is_final(*state))
             result = RUNS_ALIVE;
     }
-    pthread_mutex_unlock(&s->lock); // others look runs up meanwhile; none is made or removed
-    if (result == RUNS_REMOVED && journal_remove(s->host->data_dir, id, why) != 0)
-        result = RUNS_REMOVAL_FAILED;
-    pthread_mutex_lock(&s->lock);
     if (result == RUNS_REMOVED) {
         run = s->items[k];
         memmove(s->items + k, s->items + k + 1, (s->count - k - 1) * sizeof(struct run *));
         s->count--;
     }
-    pthread_mutex_unlock(&s->lock);
+    pthread_mutex_unlock(&s->lock); // out of the table, then off the disk, which can take its time
+    if (run != NULL && journal_remove(s->host->data_dir, id, why) != 0) {
+        result = RUNS_REMOVAL_FAILED;
+        pthread_mutex_lock(&s->lock); // `making` is still held: its room is still there
+        memmove(s->items + k + 1, s->items + k, (s->count - k) * sizeof(struct run *));
+        s->items[k] = run;
+        s->count++;
+        pthread_mutex_unlock(&s->lock);
+        run = NULL;
+    }
     pthread_mutex_unlock(&s->making);
     if (run != NULL)
         log_info("deleted", "run=%s", id);

@@ -115,23 +115,43 @@ static void keep_real(struct mpm_wall *w, const struct mpm_grid *g, const double
     }
 }
 
-static void fold(struct mpm_wall *w, struct mpm_grid *g, const double *gravity, double dt) {
+// Which columns of a wall that separates leave it: those whose node on the wall would, left alone,
+// move away. Behind another wall the image decides.
+static void open_columns(const struct mpm_wall *walls, size_t n_walls, struct mpm_wall *w,
+                         const struct mpm_grid *g, const double *gravity, double dt) {
     const int dim = g->dim, axis = w->def.axis;
-    const size_t stride = g->stride[axis];
+    FOR_COLUMNS(w, g, column, k) {
+        const double *plane =
+            g->node + (column + (size_t)w->plane * g->stride[axis]) * MPM_NODE(dim);
+        const double m = plane[0];
+        const double v = m > 0 ? (plane[1 + axis] + dt * plane[1 + dim + axis]) / m +
+                                     dt * gravity[axis] - w->def.velocity[axis]
+                               : 0;
+        w->open[k] = w->def.keeps_above ? v > 0 : v < 0;
+    }
+    for (const struct mpm_wall *o = walls; o < walls + n_walls; o++) {
+        if (!o->active || !o->folds || o->def.axis == axis || !reaches_window(o, g)) {
+            continue;
+        }
+        FOR_COLUMNS(w, g, column, k) {
+            (void)column;
+            if (o->def.axis == u_ && i_ == o->ghost) {
+                w->open[k] = w->open[(size_t)o->inner * (size_t)g->n[w_] + (size_t)j_];
+            } else if (o->def.axis == w_ && j_ == o->ghost) {
+                w->open[k] = w->open[(size_t)i_ * (size_t)g->n[w_] + (size_t)o->inner];
+            }
+        }
+    }
+}
+
+static void fold(const struct mpm_wall *w, struct mpm_grid *g, const double *gravity) {
+    const int dim = g->dim;
+    const size_t stride = g->stride[w->def.axis];
     FOR_COLUMNS(w, g, column, k) {
         double *ghost = g->node + (column + (size_t)w->ghost * stride) * MPM_NODE(dim);
-        const double *plane = g->node + (column + (size_t)w->plane * stride) * MPM_NODE(dim);
         double *inner = g->node + (column + (size_t)w->inner * stride) * MPM_NODE(dim);
-        if (w->open) {
-            // Leaves the wall if, left alone, the node on it would move away.
-            const double m = plane[0];
-            const double v = m > 0 ? (plane[1 + axis] + dt * plane[1 + dim + axis]) / m +
-                                         dt * gravity[axis] - w->def.velocity[axis]
-                                   : 0;
-            w->open[k] = w->def.keeps_above ? v > 0 : v < 0;
-            if (w->open[k]) {
-                continue;
-            }
+        if (w->open && w->open[k]) {
+            continue;
         }
         const double m_ghost = ghost[0];
         for (int d = 0; d < dim; d++) {
@@ -151,6 +171,16 @@ static void fold(struct mpm_wall *w, struct mpm_grid *g, const double *gravity, 
     }
 }
 
+// The folding walls in the order in which they fold, k = 0 .. 2 n_walls - 1, with NULL for gaps:
+// those that separate come last, so that each of their columns decides with all that its images
+// bring.
+static struct mpm_wall *in_order(struct mpm_wall *walls, size_t n_walls, const struct mpm_grid *g,
+                                 size_t k) {
+    struct mpm_wall *w = &walls[k % n_walls];
+    const bool separates = w->def.condition == MPM_WALL_SEPARATE;
+    return w->active && w->folds && separates == (k >= n_walls) && reaches_window(w, g) ? w : NULL;
+}
+
 void mpm_walls_fold(struct mpm_wall *walls, size_t n_walls, struct mpm_grid *g,
                     const double *gravity, double dt) {
     for (size_t k = 0; k < n_walls; k++) {
@@ -159,9 +189,13 @@ void mpm_walls_fold(struct mpm_wall *walls, size_t n_walls, struct mpm_grid *g,
             keep_real(w, g, gravity);
         }
     }
-    for (size_t k = 0; k < n_walls; k++) {
-        if (walls[k].active && walls[k].folds && reaches_window(&walls[k], g)) {
-            fold(&walls[k], g, gravity, dt);
+    for (size_t k = 0; k < 2 * n_walls; k++) {
+        struct mpm_wall *w = in_order(walls, n_walls, g, k);
+        if (w && w->open) {
+            open_columns(walls, n_walls, w, g, gravity, dt);
+        }
+        if (w) {
+            fold(w, g, gravity);
         }
     }
 }
@@ -307,7 +341,7 @@ static void folded_reaction(const struct mpm_wall *walls, struct mpm_wall *w,
                 g->velocity + (column + (size_t)planes[q] * stride) * MPM_VELOCITY(dim);
             place[axis] = planes[q];
             for (int d = 0; d < dim; d++) {
-                bool mine = parity(w, d) < 0;
+                bool mine = holds(w, g, place, d);
                 for (const struct mpm_wall *o = walls; mine && o < w; o++) {
                     mine = !holds(o, g, place, d);
                 }
@@ -329,14 +363,16 @@ void mpm_walls_apply(struct mpm_wall *walls, size_t n_walls, struct mpm_grid *g,
     }
     // All planes before any ghost: of two walls one cell apart, each one's plane is the other's
     // inner plane. Backwards: the corner's ghost is the image of an image.
-    for (size_t k = n_walls; k-- > 0;) {
-        if (walls[k].active && walls[k].folds && reaches_window(&walls[k], g)) {
-            hold_plane(&walls[k], g);
+    for (size_t k = 2 * n_walls; k-- > 0;) {
+        const struct mpm_wall *w = in_order(walls, n_walls, g, k);
+        if (w) {
+            hold_plane(w, g);
         }
     }
-    for (size_t k = n_walls; k-- > 0;) {
-        if (walls[k].active && walls[k].folds && reaches_window(&walls[k], g)) {
-            fill_ghosts(&walls[k], g);
+    for (size_t k = 2 * n_walls; k-- > 0;) {
+        const struct mpm_wall *w = in_order(walls, n_walls, g, k);
+        if (w) {
+            fill_ghosts(w, g);
         }
     }
     for (size_t k = 0; k < n_walls; k++) {

@@ -1,0 +1,198 @@
+// fbar run: create a run, record it, show its progress, exit with its outcome.
+#include <cjson/cJSON.h>
+#include <math.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <unistd.h>
+
+#include "client/arguments.h"
+#include "client/client.h"
+#include "client/daemon.h"
+#include "client/interrupt.h"
+#include "client/overrides.h"
+#include "client/progress.h"
+#include "client/recorder.h"
+#include "client/report.h"
+#include "client/request.h"
+#include "client/terminal.h"
+
+static const struct option_spec options[] = {
+    {"output", 'o', "FILE.h5", "record every frame into FILE.h5 (and FILE.xdmf)"},
+    {"set", 's', "KEY=VALUE",
+     "override a value of the scene, as in --set materials.water.density=1e3"},
+    {"id", 0, "ID", "name of the run"},
+    {"compress", 0, "1..9", "shuffle and deflate the recording"},
+    {NULL, 0, NULL, NULL},
+};
+
+static bool answers(struct request *requests) {
+    struct reply reply;
+    char why[256];
+    const struct request_spec spec = {.method = "GET", .path = "/healthz", .timeout_ms = 2000};
+    if (request_send(requests, &spec, &reply, why, sizeof why) != 0)
+        return false;
+    const bool good = reply.status == 200;
+    request_reply_free(&reply);
+    return good;
+}
+
+static char *request_body(const struct arguments *arguments) {
+    char *scene = overrides_scene(arguments->positionals[0]), *body = NULL, *rest = NULL;
+    cJSON *patch = cJSON_CreateObject(), *members = cJSON_CreateObject();
+    const char *word, *id = arguments_value(arguments, "id");
+    int cursor = 0, status = scene ? 0 : -1;
+    while (status == 0 && (word = arguments_next(arguments, "set", &cursor)))
+        status = overrides_add(patch, word);
+    cJSON_AddTrueToObject(members, "start");
+    if (id)
+        cJSON_AddStringToObject(members, "id", id);
+    rest = cJSON_PrintUnformatted(members);
+    if (status == 0 && rest) {
+        rest[strlen(rest) - 1] = '\0'; // members without the braces
+        body = overrides_body(scene, patch, rest + 1);
+    }
+    free(rest);
+    free(scene);
+    cJSON_Delete(patch);
+    cJSON_Delete(members);
+    return body;
+}
+
+// Looks at the run until it is over. On Ctrl-C it is paused, or cancelled where nobody else could.
+static int watch(struct client *client, const char *path, bool private, cJSON **run) {
+    bool asked = false;
+    double shown = -INFINITY, clock = 0;
+    for (;;) {
+        cJSON_Delete(*run);
+        const int code = request_json(client, "GET", path, NULL, run);
+        if (code != CLIENT_DONE)
+            return code;
+        const bool over = progress_over(*run);
+        if (over || clock - shown >= progress_interval()) {
+            progress_show(*run);
+            shown = clock;
+        }
+        if (over || (asked && !private)) {
+            progress_end();
+            return asked ? CLIENT_INTERRUPTED : CLIENT_DONE;
+        }
+        if (interrupt_count() > 1)
+            return CLIENT_INTERRUPTED;
+        if (interrupt_count() && !asked) {
+            char *action = NULL;
+            if (asprintf(&action, "%s:%s", path, private ? "cancel" : "pause") > 0)
+                request_json(client, "POST", action, NULL, NULL);
+            free(action);
+            asked = true;
+            continue;
+        }
+        usleep(100000);
+        clock += 0.1;
+    }
+}
+
+static int follow(struct client *client, const struct arguments *arguments, const char *id,
+                  bool private) {
+    const char *file = arguments_value(arguments, "output");
+    char *path = request_path("/v1/runs/", id, "");
+    double compress = 0;
+    cJSON *run = NULL;
+    struct recorder_result result = {0};
+    int code =
+        arguments_number(arguments, "compress", 1, 9, &compress) == 0 ? CLIENT_DONE : CLIENT_USAGE;
+    if (code == CLIENT_DONE && file) {
+        const struct recorder_options record = {.run = id,
+                                                .file = file,
+                                                .compress = (int)compress,
+                                                .patience_s = private ? 1 : 60,
+                                                .progress = true,
+                                                .on_interrupt = private ? "cancel" : "pause"};
+        code = recorder_record(client, &record, &result);
+    } else if (code == CLIENT_DONE) {
+        code = watch(client, path, private, &run);
+    }
+    if (code == CLIENT_DONE || code == CLIENT_INTERRUPTED) {
+        cJSON_Delete(run);
+        const int shown = interrupt_count() > 1 ? CLIENT_INTERRUPTED
+                                                : request_json(client, "GET", path, NULL, &run);
+        if (shown != CLIENT_DONE)
+            run = NULL;
+        if (run && client->json)
+            report_json(run);
+        const int outcome = !run           ? shown
+                            : client->json ? report_exit_code(run)
+                                           : report_outcome(run);
+        if (file && !client->json)
+            printf("%s: %zu frames, %.1f MB%s\n", file, result.n_frames,
+                   1e-6 * (double)result.bytes, result.complete ? "" : ", not complete");
+        if (code == CLIENT_DONE)
+            code = outcome;
+        else if (!private)
+            terminal_note("paused; `fbar resume %s` continues it%s%s%s", id,
+                          file ? ", and `fbar record " : "", file ? id : "",
+                          file ? " -o ...` the recording" : "");
+    }
+    cJSON_Delete(run);
+    free(path);
+    return code;
+}
+
+static int create_and_follow(struct client *client, const struct arguments *arguments,
+                             const char *body, bool private) {
+    cJSON *run;
+    const int code = request_json(client, "POST", "/v1/runs", body, &run);
+    if (code != CLIENT_DONE)
+        return code;
+    const char *id = cJSON_GetStringValue(cJSON_GetObjectItemCaseSensitive(run, "id"));
+    const int result = follow(client, arguments, id ? id : "", private);
+    cJSON_Delete(run);
+    return result;
+}
+
+static int run(struct client *client, const struct arguments *arguments) {
+    const char *file = arguments_value(arguments, "output");
+    double compress = 0;
+    if (arguments_number(arguments, "compress", 1, 9, &compress) != 0)
+        return CLIENT_USAGE;
+    if (file) { // better now than after an hour
+        const int code = recorder_check_file(file, arguments_value(arguments, "id"));
+        if (code != CLIENT_DONE)
+            return code;
+    }
+    char *body = request_body(arguments);
+    if (!body)
+        return CLIENT_USAGE;
+    int code;
+    if (client->url_given || answers(client->requests)) {
+        code = create_and_follow(client, arguments, body, false);
+    } else {
+        struct daemon daemon;
+        struct client own = *client;
+        code = interrupt_count() ? CLIENT_INTERRUPTED : CLIENT_UNREACHABLE;
+        if (daemon_start(&daemon) == 0) {
+            own.url = daemon.url;
+            own.requests = request_create(daemon.url, NULL);
+            if (own.requests)
+                code = create_and_follow(&own, arguments, body, true);
+            request_free(own.requests);
+            daemon_stop(&daemon);
+        }
+    }
+    free(body);
+    return code;
+}
+
+const struct command cmd_run = {
+    .name = "run",
+    .positionals = "SCENE",
+    .summary = "create a run, record it, show its progress",
+    .doc = "SCENE is the name of a built-in scene (`fbar scenes`) or a .json file. Without --url, "
+           "and\n"
+           "with no daemon at the default address, a private one is started for this run.\n"
+           "Ctrl-C pauses the run (a private daemon's is cancelled) and closes the file.",
+    .least = 1,
+    .most = 1,
+    .options = options,
+    .run = run,
+};

@@ -1,0 +1,79 @@
+// fbar validate: every fault of a scene, or what it will cost.
+#include <cjson/cJSON.h>
+#include <stdio.h>
+#include <stdlib.h>
+
+#include "client/arguments.h"
+#include "client/client.h"
+#include "client/overrides.h"
+#include "client/report.h"
+#include "client/request.h"
+
+static const struct option_spec options[] = {
+    {"set", 's', "KEY=VALUE", "override a value of the scene"},
+    {NULL, 0, NULL, NULL},
+};
+
+// A built-in scene is asked for first: the daemon validates scenes, not names.
+static int scene_text(struct client *client, const char *word, char **out) {
+    *out = overrides_scene(word);
+    if (!*out)
+        return CLIENT_USAGE;
+    if ((*out)[0] != '"')
+        return CLIENT_DONE;
+    free(*out);
+    *out = NULL;
+    struct reply reply;
+    char *path = request_path("/v1/scenes/", word, "");
+    const struct request_spec spec = {
+        .method = "GET", .path = path ? path : "/", .accept = "application/json"};
+    const int code = request_expect(client, &spec, &reply);
+    free(path);
+    if (code == CLIENT_DONE)
+        *out = reply.body;
+    return code;
+}
+
+static void print_estimate(const cJSON *answer) {
+    const cJSON *estimate = cJSON_GetObjectItemCaseSensitive(answer, "estimate"), *item;
+    if (!cJSON_IsObject(estimate))
+        estimate = answer;
+    puts("valid");
+    cJSON_ArrayForEach(item, estimate) if (cJSON_IsNumber(item))
+        printf("%-12s %.6g\n", item->string, item->valuedouble);
+}
+
+static int run(struct client *client, const struct arguments *arguments) {
+    char *scene, *body = NULL;
+    cJSON *patch = cJSON_CreateObject(), *answer = NULL;
+    const char *word;
+    int cursor = 0, code = CLIENT_DONE;
+    while (code == CLIENT_DONE && (word = arguments_next(arguments, "set", &cursor)))
+        if (overrides_add(patch, word) != 0)
+            code = CLIENT_USAGE;
+    if (code == CLIENT_DONE &&
+        (code = scene_text(client, arguments->positionals[0], &scene)) == CLIENT_DONE) {
+        body = overrides_body(scene, patch, "");
+        code = body ? request_json(client, "POST", "/v1/scenes:validate", body, &answer)
+                    : CLIENT_USAGE;
+        free(scene);
+    }
+    if (code == CLIENT_DONE && client->json)
+        report_json(answer);
+    else if (code == CLIENT_DONE)
+        print_estimate(answer);
+    free(body);
+    cJSON_Delete(patch);
+    cJSON_Delete(answer);
+    return code;
+}
+
+const struct command cmd_validate = {
+    .name = "validate",
+    .positionals = "SCENE",
+    .summary = "check a scene and estimate its cost",
+    .least = 1,
+    .most = 1,
+    .options = options,
+    .run = run,
+};

@@ -1,0 +1,261 @@
+// Append-only log with checksums, chained heads and a torn tail that is told from damage
+// (framelog.h).
+#include "client/framelog.h"
+
+#include <errno.h>
+#include <fcntl.h>
+#include <libgen.h>
+#include <limits.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/file.h>
+#include <sys/stat.h>
+#include <sys/uio.h>
+#include <unistd.h>
+#include <xxhash.h>
+
+#define HEAD 64
+#define MAGIC "FBARREC1"
+
+struct head {
+    char magic[8];
+    uint32_t kind, zero;
+    uint64_t bytes, digest, durable, previous, own;
+    uint64_t zeros;
+};
+_Static_assert(sizeof(struct head) == HEAD, "the head is written as it lies in memory");
+
+struct framelog {
+    int fd;
+    char *path;
+    uint64_t end;      // of the good records
+    uint64_t durable;  // length known to be on disk
+    uint64_t previous; // digest of the last head
+    uint64_t cursor, cursor_previous;
+    bool read_to_end;
+    unsigned char *payload;
+    size_t capacity;
+};
+
+static uint64_t padded(uint64_t n) {
+    return (n + HEAD - 1) / HEAD * HEAD;
+}
+
+static uint64_t head_digest(const struct head *head) {
+    return XXH3_64bits(head, offsetof(struct head, own));
+}
+
+static bool head_valid(const struct head *head) {
+    return memcmp(head->magic, MAGIC, 8) == 0 && head->own == head_digest(head) &&
+           head->zeros == 0 && head->bytes <= (uint64_t)INT64_MAX / 2;
+}
+
+// Reads exactly `n` bytes at `at`: 1, 0 when the file ends before, -1 on an error.
+static int read_at(int fd, void *out, size_t n, uint64_t at) {
+    size_t done = 0;
+    while (done < n) {
+        const ssize_t got = pread(fd, (char *)out + done, n - done, (off_t)(at + done));
+        if (got < 0 && errno == EINTR)
+            continue;
+        if (got < 0)
+            return -1;
+        if (got == 0)
+            return 0;
+        done += (size_t)got;
+    }
+    return 1;
+}
+
+struct framelog *framelog_open(const char *path, bool create, char *why, size_t why_bytes) {
+    struct framelog *log = calloc(1, sizeof *log);
+    if (!log || !(log->path = strdup(path))) {
+        free(log);
+        snprintf(why, why_bytes, "out of memory");
+        return NULL;
+    }
+    log->fd = open(path, O_RDWR | O_CLOEXEC | (create ? O_CREAT : 0), 0666);
+    if (log->fd < 0) {
+        snprintf(why, why_bytes, "%s: %s", path, strerror(errno));
+        goto fail;
+    }
+    if (flock(log->fd, LOCK_EX | LOCK_NB) != 0) {
+        snprintf(why, why_bytes, "%s: another fbar is recording into it", path);
+        goto fail;
+    }
+    return log;
+fail:;
+    const int error = errno;
+    framelog_close(log);
+    errno = error;
+    return NULL;
+}
+
+void framelog_close(struct framelog *log) {
+    if (!log)
+        return;
+    if (log->fd >= 0)
+        close(log->fd);
+    free(log->payload);
+    free(log->path);
+    free(log);
+}
+
+void framelog_rewind(struct framelog *log) {
+    log->cursor = log->cursor_previous = 0;
+}
+
+// Whether a record after `from` was appended when the place `from` was already known to be on disk.
+static int durable_beyond(struct framelog *log, uint64_t from, uint64_t size, bool *out) {
+    struct head head;
+    *out = false;
+    for (uint64_t at = padded(from + 1); at + HEAD <= size; at += HEAD) {
+        if (read_at(log->fd, &head, HEAD, at) < 0)
+            return -1;
+        if (head_valid(&head) && head.durable > from) {
+            *out = true;
+            return 0;
+        }
+    }
+    return 0;
+}
+
+static int fail_errno(const struct framelog *log, char *why, size_t why_bytes) {
+    snprintf(why, why_bytes, "%s: %s", log->path, strerror(errno));
+    return -1;
+}
+
+// What is wrong at the cursor: a torn tail is cut (0), anything else is reported (-1).
+static int end_of_log(struct framelog *log, uint64_t size, uint64_t *cut, char *why,
+                      size_t why_bytes) {
+    bool damaged;
+    if (durable_beyond(log, log->cursor, size, &damaged) != 0)
+        return fail_errno(log, why, why_bytes);
+    if (damaged) {
+        snprintf(why, why_bytes,
+                 "%s: damaged at byte %llu, before its end; it is left as it is (`fbar recover` "
+                 "builds a file from what precedes the damage)",
+                 log->path, (unsigned long long)log->cursor);
+        errno = EBADMSG;
+        return -1;
+    }
+    *cut = size - log->cursor;
+    if (*cut > 0 && ftruncate(log->fd, (off_t)log->cursor) != 0)
+        return fail_errno(log, why, why_bytes);
+    if (!log->read_to_end) {
+        log->end = log->cursor;
+        log->previous = log->cursor_previous;
+        log->read_to_end = true;
+    }
+    return 0;
+}
+
+int framelog_read(struct framelog *log, struct framelog_record *out, uint64_t *cut, char *why,
+                  size_t why_bytes) {
+    struct stat status;
+    struct head head;
+    *cut = 0;
+    if (fstat(log->fd, &status) != 0)
+        return fail_errno(log, why, why_bytes);
+    const uint64_t size = (uint64_t)status.st_size;
+    if (log->cursor + HEAD > size)
+        return end_of_log(log, size, cut, why, why_bytes);
+    if (read_at(log->fd, &head, HEAD, log->cursor) < 0)
+        return fail_errno(log, why, why_bytes);
+    if (!head_valid(&head) || head.previous != log->cursor_previous ||
+        head.bytes > size - log->cursor - HEAD)
+        return end_of_log(log, size, cut, why, why_bytes);
+    if (head.bytes > log->capacity) {
+        unsigned char *grown = realloc(log->payload, head.bytes);
+        if (!grown) {
+            snprintf(why, why_bytes, "out of memory");
+            return -1;
+        }
+        log->payload = grown;
+        log->capacity = head.bytes;
+    }
+    const int got = read_at(log->fd, log->payload, head.bytes, log->cursor + HEAD);
+    if (got < 0)
+        return fail_errno(log, why, why_bytes);
+    if (got == 0 || XXH3_64bits(log->payload, head.bytes) != head.digest ||
+        log->cursor + HEAD + padded(head.bytes) > size)
+        return end_of_log(log, size, cut, why, why_bytes);
+    log->cursor += HEAD + padded(head.bytes);
+    log->cursor_previous = head.own;
+    *out = (struct framelog_record){
+        .kind = (enum framelog_kind)head.kind, .payload = log->payload, .bytes = head.bytes};
+    return 1;
+}
+
+int framelog_append(struct framelog *log, enum framelog_kind kind, const void *payload,
+                    size_t bytes, char *why, size_t why_bytes) {
+    static const unsigned char zeros[HEAD];
+    struct head head = {.kind = kind,
+                        .bytes = bytes,
+                        .digest = XXH3_64bits(payload, bytes),
+                        .durable = log->durable,
+                        .previous = log->previous};
+    memcpy(head.magic, MAGIC, 8);
+    head.own = head_digest(&head);
+    struct iovec parts[3] = {{.iov_base = &head, .iov_len = HEAD},
+                             {.iov_base = (void *)payload, .iov_len = bytes},
+                             {.iov_base = (void *)zeros, .iov_len = padded(bytes) - bytes}};
+    uint64_t at = log->end;
+    const uint64_t end = at + HEAD + padded(bytes);
+    int first = 0;
+    while (at < end) {
+        ssize_t wrote = pwritev(log->fd, parts + first, 3 - first, (off_t)at);
+        if (wrote < 0 && errno == EINTR)
+            continue;
+        if (wrote <= 0) {
+            const int error = wrote < 0 ? errno : EIO;
+            // Best effort: what is left of the record is a torn tail, which the next open cuts.
+            if (ftruncate(log->fd, (off_t)log->end) != 0)
+                errno = error;
+            errno = error;
+            return fail_errno(log, why, why_bytes);
+        }
+        at += (uint64_t)wrote;
+        while (first < 3 && (size_t)wrote >= parts[first].iov_len)
+            wrote -= (ssize_t)parts[first++].iov_len;
+        if (first < 3) {
+            parts[first].iov_base = (char *)parts[first].iov_base + wrote;
+            parts[first].iov_len -= (size_t)wrote;
+        }
+    }
+    log->end = end;
+    log->previous = head.own;
+    return 0;
+}
+
+int framelog_sync(struct framelog *log, char *why, size_t why_bytes) {
+    if (log->durable == log->end)
+        return 0;
+    struct stat here, named;
+    if (fdatasync(log->fd) != 0)
+        return fail_errno(log, why, why_bytes);
+    // A log whose name is gone would be lost with this process: not durable.
+    if (fstat(log->fd, &here) != 0 || stat(log->path, &named) != 0)
+        return fail_errno(log, why, why_bytes);
+    if (here.st_ino != named.st_ino || here.st_dev != named.st_dev) {
+        snprintf(why, why_bytes, "%s: was replaced while recording", log->path);
+        return -1;
+    }
+    if (log->durable == 0) { // once: the name itself
+        char folder[PATH_MAX];
+        snprintf(folder, sizeof folder, "%s", log->path);
+        const int fd = open(dirname(folder), O_RDONLY | O_DIRECTORY | O_CLOEXEC);
+        if (fd < 0 || fsync(fd) != 0) {
+            if (fd >= 0)
+                close(fd);
+            return fail_errno(log, why, why_bytes);
+        }
+        close(fd);
+    }
+    log->durable = log->end;
+    return 0;
+}
+
+uint64_t framelog_bytes(const struct framelog *log) {
+    return log->end;
+}

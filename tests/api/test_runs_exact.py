@@ -1,0 +1,49 @@
+"""What the log says of a run in motion is exact, to the step."""
+import json
+import pathlib
+
+from boxes import endless, escaping, water
+from fbard import until
+
+
+def config_events(daemon, run):
+    path = pathlib.Path(daemon.data) / "runs" / run / "events.jsonl"
+    events = [json.loads(line) for line in path.read_text().splitlines()]
+    return [e for e in events if e.get("patch") is not None]
+
+
+def test_patches_of_a_running_run_are_logged_at_their_effective_step(daemon, name):
+    daemon.create(endless(), id=name)
+    daemon.wait(name, "running")
+    steps = [daemon.patch(name, {"damping": {"mass": k * 1e-6}})["effective_step"] for k in range(1, 21)]
+    assert [e["step"] for e in config_events(daemon, name)] == steps
+    assert steps[-1] > steps[0], "it ran meanwhile"
+    daemon.away(name)
+
+
+def test_patched_in_motion_and_killed_it_continues_with_the_same_bits(fresh):
+    """Epoch 0: every frame that is simulated again has the digest that the journal holds."""
+    d = fresh().start()
+    scene = water(time={"dt": 2e-4, "end": 2.0}, output={"interval": 0.02, "probe_interval": 0.01})
+    d.create(scene, id="patched")
+    for k in range(6):
+        d.wait_step("patched", 300 * (k + 1))
+        d.patch("patched", {"fbar": k % 2 == 0})
+    d.wait_step("patched", 2500)
+    before = [d.frame("patched", f["seq"]) for f in d.frames("patched")]
+    assert d.run("patched")["state"] == "running", "too quick a machine: it is over"
+    d.kill()
+    d.start()
+    run = d.wait("patched", "completed")
+    assert run["epoch"] == 0, run["warnings"]
+    assert [d.frame("patched", k) for k in range(len(before))] == before
+
+
+def test_failed_run_keeps_a_checkpoint_and_its_last_good_frame(daemon, name):
+    daemon.create(escaping(), id=name)
+    run = daemon.wait(name, "failed")
+    folder = pathlib.Path(daemon.data) / "runs" / name
+    assert until(lambda: list(folder.glob("checkpoint*")), 10), sorted(p.name for p in folder.iterdir())
+    frames = daemon.frames(name)
+    assert frames[-1]["end"] and frames[-1]["step"] < run["error"]["step"]
+    daemon.away(name)

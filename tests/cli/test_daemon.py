@@ -1,0 +1,271 @@
+"""fbar with the real fbard: a recording against the daemon's own frames, and `fbar run` on its own."""
+import json
+import os
+import pathlib
+import re
+import select
+import signal
+import subprocess
+import time
+import urllib.error
+import urllib.request
+
+import h5py
+import numpy as np
+import pytest
+
+import conftest
+from fake import unpack
+from recording import check_frames, read_xdmf
+
+pytestmark = pytest.mark.skipif(not os.access(conftest.FBARD, os.X_OK), reason="fbard is not built")
+
+# The dam break, small: 512 particles, some hundred steps.
+SMALL = ["--set", "materials.water.bulk_modulus=2e6", "--set", "time.dt=null",
+         "--set", "time.cfl=0.3", "--set", "time.end=0.3", "--set", "output.interval=0.01",
+         "--set", "bodies.reservoir.particles_per_cell=4", "--set", "output.fields="
+         '["position","velocity","mean_stress","stress","volume_ratio","id","body"]',
+         "--set", "references=[]"]
+
+
+def get(url, accept="*/*"):
+    request = urllib.request.Request(url, headers={"Accept": accept})
+    with urllib.request.urlopen(request, timeout=10) as reply:
+        return reply.read()
+
+
+@pytest.fixture(scope="module")
+def daemon(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("fbard")
+    ports = folder / "ports.json"
+    process = subprocess.Popen([conftest.FBARD, "--http", "127.0.0.1:0", "--publish", "tcp://127.0.0.1:0",
+                                "--port-file", str(ports), "--data-dir", str(folder / "data")],
+                               stderr=open(folder / "log", "w"))
+    end = time.monotonic() + 10
+    while not ports.exists():
+        assert process.poll() is None and time.monotonic() < end, (folder / "log").read_text()
+        time.sleep(0.01)
+    yield json.loads(ports.read_text())["http"]
+    process.terminate()
+    assert process.wait(20) == 0
+
+
+@pytest.fixture
+def temporary(tmp_path, monkeypatch):
+    """Where a private daemon keeps its things; empty again at the end."""
+    folder = tmp_path / "t"
+    folder.mkdir()
+    monkeypatch.setenv("TMPDIR", str(folder))
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def no_default_daemon():
+    """`fbar run` starts a private daemon only where none answers at the default address."""
+    try:
+        get("http://127.0.0.1:7800/healthz")
+        pytest.skip("a daemon runs at the default address")
+    except OSError:
+        pass
+
+
+def all_frames(url, run):
+    index = json.loads(get(f"{url}/v1/runs/{run}/frames"))["frames"]
+    return [get(f"{url}/v1/runs/{run}/frames/{entry['seq']}") for entry in index]
+
+
+def test_run_records_what_the_daemon_published(daemon, fbar, tmp_path):
+    result = fbar("run", "dam-break", *SMALL, "--id", "whole", "-o", "a.h5", url=daemon, timeout=60)
+    assert result.returncode == 0, result.stderr
+    frames = all_frames(daemon, "whole")
+    assert len(frames) > 20
+    check_frames(tmp_path / "a.h5", frames)
+    assert len(read_xdmf(tmp_path / "a.xdmf")) == len(frames)
+    scene = json.loads(get(f"{daemon}/v1/runs/whole/scene"))
+    csv = get(f"{daemon}/v1/runs/whole/probes", "text/csv").decode().splitlines()
+    with h5py.File(tmp_path / "a.h5") as f:
+        assert json.loads(f["fbard/scene"][()]) == scene
+        names = csv[0].split(",")
+        table = np.array([[float(x or "nan") for x in line.split(",")] for line in csv[1:]])
+        front = f["fbard/probes/front"]
+        np.testing.assert_array_equal(front["step"][:], table[:, 0])
+        np.testing.assert_array_equal(front["time"][:], table[:, 1])
+        np.testing.assert_array_equal(front["value"][:], table[:, names.index("front")])
+        assert f["VTKHDF/Points"].shape[0] == 512 * len(frames)
+    # A recording of the finished run, over HTTP alone, is the same file.
+    assert fbar("record", "whole", "-o", "b.h5", url=daemon).returncode == 0
+    assert (tmp_path / "a.h5").read_bytes() == (tmp_path / "b.h5").read_bytes()
+
+
+def test_record_killed_beside_a_live_run(daemon, fbar, start_fbar, tmp_path):
+    result = start_fbar("run", "dam-break", *SMALL, "--set", "time.end=1", "--id", "killed", "-o",
+                        "whole.h5", url=daemon)
+    end = time.monotonic() + 10
+    while fbar("show", "killed", url=daemon).returncode:
+        assert time.monotonic() < end and result.poll() is None
+        time.sleep(0.02)
+    for _ in range(6):
+        recorder = start_fbar("record", "killed", "-o", "a.h5", url=daemon)
+        time.sleep(0.08)
+        recorder.kill()
+        recorder.wait()
+    final = fbar("record", "killed", "-o", "a.h5", url=daemon, timeout=60)
+    assert final.returncode == 0, final.stderr
+    assert result.wait(60) == 0
+    assert (tmp_path / "a.h5").read_bytes() == (tmp_path / "whole.h5").read_bytes()
+
+
+def test_commands_on_a_live_run(daemon, fbar):
+    scenes = fbar("scenes", url=daemon)
+    assert scenes.returncode == 0 and "dam-break" in scenes.stdout
+    assert fbar("validate", "dam-break", url=daemon).returncode == 0
+    request = urllib.request.Request(f"{daemon}/v1/runs", method="POST", data=json.dumps(
+        {"scene": "dam-break", "id": "live", "start": False}).encode(),
+        headers={"Content-Type": "application/json"})
+    urllib.request.urlopen(request, timeout=10).close()
+    assert "paused" in fbar("show", "live", url=daemon).stdout
+    assert fbar("step", "live", "--steps", "50", url=daemon).returncode == 0
+    end = time.monotonic() + 20
+    while json.loads(fbar("--json", "show", "live", url=daemon).stdout)["step"] < 50:
+        assert time.monotonic() < end
+    assert fbar("set", "live", "fbar=false", url=daemon).returncode == 0
+    assert json.loads(fbar("--json", "show", "live", url=daemon).stdout)["fbar"] is False
+    assert fbar("resume", "live", url=daemon).returncode == 0
+    assert fbar("pause", "live", url=daemon).returncode == 0
+    assert fbar("cancel", "live", url=daemon).returncode == 0
+    assert "live" in fbar("list", url=daemon).stdout
+    assert fbar("watch", "live", url=daemon).returncode == 1
+    assert fbar("probes", "live", "--csv", url=daemon).stdout.startswith("step,time")
+    assert fbar("delete", "live", url=daemon).returncode == 0
+    assert fbar("show", "live", url=daemon).returncode == 2
+
+
+def test_an_invalid_scene_exits_2_with_its_pointers(daemon, fbar, tmp_path):
+    result = fbar("run", "dam-break", "--set", "materials.water.density=-1", "--set", "cel=1",
+                  "-o", "a.h5", url=daemon)
+    assert result.returncode == 2
+    assert "/materials/water/density: " in result.stderr and "/cel: " in result.stderr
+    assert all(line.startswith("fbar: /") for line in result.stderr.splitlines())
+    assert list(tmp_path.iterdir()) == []
+    assert fbar("run", "dam-brake", url=daemon).returncode == 2
+
+
+def test_a_failing_run_exits_1_and_its_recording_is_whole(daemon, fbar, tmp_path):
+    result = fbar("run", "dam-break", *SMALL, "--set", "time.cfl=null", "--set", "time.dt=0.02",
+                  "--set", "time.unstable_ok=true", "--id", "fails", "-o", "a.h5", url=daemon)
+    assert result.returncode == 1, result.stderr
+    assert "fbar: " in result.stderr
+    check_frames(tmp_path / "a.h5", all_frames(daemon, "fails"))
+
+
+# ---- Private daemons ----------------------------------------------------------------------------------
+
+def children(pid):
+    return [int(p) for p in pathlib.Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+
+
+def wait_for_child(process):
+    end = time.monotonic() + 10
+    while time.monotonic() < end:
+        for child in children(process.pid):
+            if b"--port-file" in pathlib.Path(f"/proc/{child}/cmdline").read_bytes():
+                return child
+        time.sleep(0.005)
+    raise AssertionError("no daemon was started")
+
+
+def gone(pid, seconds=10):
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        try:
+            if pathlib.Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] == "Z":
+                return True
+        except OSError:
+            return True
+        time.sleep(0.01)
+    return False
+
+
+def test_run_alone_starts_and_stops_its_daemon(fbar, temporary, tmp_path):
+    result = fbar("run", "dam-break", *SMALL, "-o", "a.h5", timeout=60)
+    assert result.returncode == 0, result.stderr
+    assert list(temporary.iterdir()) == []
+    with h5py.File(tmp_path / "a.h5") as f:
+        assert f["fbard"].attrs["complete"] == 1
+
+
+def test_run_alone_interrupted_cancels_and_leaves_nothing(start_fbar, temporary, tmp_path):
+    runner = start_fbar("run", "dam-break", "--set", "output.interval=0.001", "-o", "a.h5")
+    child = wait_for_child(runner)
+    assert len(list(temporary.iterdir())) == 1
+    log, end = tmp_path / "a.h5.log", time.monotonic() + 20
+    while not (log.exists() and log.stat().st_size > 400000):
+        assert runner.poll() is None and time.monotonic() < end
+        time.sleep(0.01)
+    runner.send_signal(signal.SIGINT)
+    out, err = runner.communicate(timeout=30)
+    assert runner.returncode == 130, err
+    assert gone(child) and list(temporary.iterdir()) == []
+    with h5py.File(tmp_path / "a.h5") as f:
+        assert len(f["fbard/frames/seq"]) >= 2
+        assert f["fbard"].attrs["state"] == b"cancelled" and f["fbard"].attrs["complete"] == 1
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.h5", "a.xdmf", "t"]
+
+
+def test_run_alone_killed_takes_its_daemon_along_and_recovers(start_fbar, fbar, temporary, tmp_path):
+    runner = start_fbar("run", "dam-break", "--set", "output.interval=0.001", "-o", "a.h5")
+    child = wait_for_child(runner)
+    log, end = tmp_path / "a.h5.log", time.monotonic() + 20
+    while not (log.exists() and log.stat().st_size > 400000):
+        assert runner.poll() is None and time.monotonic() < end
+        time.sleep(0.01)
+    runner.kill()
+    runner.wait()
+    assert gone(child)
+    assert len(list(temporary.iterdir())) == 1  # nobody was left to remove it
+    assert fbar("recover", "a.h5").returncode == 0
+    with h5py.File(tmp_path / "a.h5") as f:
+        assert len(f["fbard/frames/seq"]) >= 2 and f["fbard"].attrs["complete"] == 0
+
+
+def test_run_alone_with_an_invalid_scene_leaves_nothing(fbar, temporary, tmp_path):
+    result = fbar("run", "dam-break", "--set", "cell=-1", "-o", "a.h5")
+    assert result.returncode == 2 and "/cell: " in result.stderr
+    assert list(temporary.iterdir()) == [] and not (tmp_path / "a.h5").exists()
+
+
+# ---- docs/reading.md ----------------------------------------------------------------------------------
+
+def python_blocks():
+    text = (conftest.ROOT / "docs" / "reading.md").read_text()
+    return re.findall(r"```python\n(.*?)```", text, re.S)
+
+
+def test_reading_h5py_block_runs(daemon, fbar, tmp_path):
+    assert fbar("run", "dam-break", *SMALL, "-o", "dam.h5", url=daemon).returncode == 0
+    result = subprocess.run(["/usr/bin/python3", "-c", python_blocks()[0]], cwd=tmp_path,
+                            capture_output=True, text=True, timeout=20)
+    assert result.returncode == 0, result.stderr
+    assert len(result.stdout.splitlines()) >= 3
+
+
+def test_reading_subscriber_block_runs(daemon, fbar, tmp_path):
+    request = urllib.request.Request(f"{daemon}/v1/runs", method="POST", data=json.dumps(
+        {"scene": "dam-break", "id": "seen", "start": False,
+         "overrides": {"output": {"interval": 1e-4}}}).encode(),
+        headers={"Content-Type": "application/json"})
+    urllib.request.urlopen(request, timeout=10).close()
+    code = python_blocks()[1].replace("http://127.0.0.1:7800", daemon)
+    viewer = subprocess.Popen(["/usr/bin/python3", "-u", "-c", code], text=True,
+                              stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    try:
+        end = time.monotonic() + 20
+        while not select.select([viewer.stdout], [], [], 0.1)[0]:  # until it has subscribed
+            assert fbar("step", "seen", "-n", "20", url=daemon).returncode == 0
+            assert time.monotonic() < end
+        assert fbar("cancel", "seen", url=daemon).returncode == 0  # publishes the last frame
+        out, err = viewer.communicate(timeout=10)
+    finally:
+        viewer.kill()
+    assert viewer.returncode == 0, err
+    assert out.splitlines()[-1].startswith("seen ")
