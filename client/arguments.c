@@ -2,6 +2,7 @@
 #include "client/arguments.h"
 
 #include <math.h>
+#include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 
@@ -12,6 +13,7 @@ const struct option_spec arguments_global[] = {
     {"token-file", 0, "FILE", "file that holds the daemon's token"},
     {"json", 0, NULL, "answer in JSON on standard output"},
     {"help", 'h', NULL, "show this help"},
+    {"version", 0, NULL, "print the version"},
     {NULL, 0, NULL, NULL},
 };
 
@@ -134,10 +136,11 @@ int arguments_parse(int argc, char **argv, const struct command *command, struct
         out->options[out->n_options].spec = spec;
         out->options[out->n_options++].value = value;
     }
-    if (command && !arguments_flag(out, "help") &&
+    if (command && !arguments_flag(out, "help") && !arguments_flag(out, "version") &&
         (out->n_positionals < command->least ||
          (command->most >= 0 && out->n_positionals > command->most))) {
-        terminal_error("usage: fbar %s %s", command->name, command->positionals);
+        terminal_error("usage: fbar %s %s; `fbar %s --help` tells more", command->name,
+                       command->positionals, command->name);
         return -1;
     }
     return argc;
@@ -167,12 +170,17 @@ bool arguments_flag(const struct arguments *arguments, const char *name) {
 int arguments_number(const struct arguments *arguments, const char *name, double least, double most,
                      double *out) {
     const char *text = arguments_value(arguments, name);
-    if (!text)
-        return 0;
+    char option[64];
+    snprintf(option, sizeof option, "--%s", name);
+    return text ? arguments_read_number(option, text, least, most, out) : 0;
+}
+
+int arguments_read_number(const char *name, const char *text, double least, double most,
+                          double *out) {
     char *end;
     const double value = strtod(text, &end);
     if (end == text || *end || !isfinite(value) || value < least || value > most) {
-        terminal_error("--%s: must be a number from %g to %g, got \"%s\"", name, least, most, text);
+        terminal_error("%s: must be a number from %g to %g, got \"%s\"", name, least, most, text);
         return -1;
     }
     *out = value;

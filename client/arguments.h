@@ -32,5 +32,8 @@ const char *arguments_next(const struct arguments *arguments, const char *name, 
 // fault printed when it is none.
 int arguments_number(const struct arguments *arguments, const char *name, double least, double most,
                      double *out);
+// The same of a text; `name` is what a fault calls it.
+int arguments_read_number(const char *name, const char *text, double least, double most,
+                          double *out);
 // The name in a NULL-ended list that is closest to `word`, or NULL when none is close.
 const char *arguments_closest(const char *word, const char *const *names);

@@ -16,6 +16,7 @@
 #include <unistd.h>
 
 #include "client/framelog.h"
+#include "client/probeunits.h"
 #include "client/store.h"
 #include "client/xdmf.h"
 
@@ -232,14 +233,16 @@ static size_t probe_span(const struct table *t, size_t k, char *name, size_t n, 
     return span;
 }
 
-static int write_probes(struct store *store, const char *csv, char *why, size_t why_bytes) {
+static int write_probes(struct store *store, const struct contents *c, char *why,
+                        size_t why_bytes) {
     struct table t;
     int status = 0;
-    if (!csv || table_parse(csv, &t) != 0) {
-        if (csv)
+    if (!c->probes || table_parse(c->probes, &t) != 0) {
+        if (c->probes)
             table_free(&t);
         return 0; // a run without probes
     }
+    cJSON *scene = c->scene ? cJSON_Parse(c->scene) : NULL;
     uint64_t *steps = calloc(t.n_rows + 1, sizeof *steps);
     double *times = calloc(t.n_rows + 1, sizeof *times);
     double *values = calloc(t.n_rows * t.n_columns + 1, sizeof *values);
@@ -254,14 +257,21 @@ static int write_probes(struct store *store, const char *csv, char *why, size_t 
     for (size_t k = 2, span; status == 0 && k < t.n_columns; k += span) {
         char name[128], components[128];
         span = probe_span(&t, k, name, sizeof name, components, sizeof components);
-        for (char *c = name; *c; c++)
-            if (*c == '/')
-                *c = '_'; // a path separator in HDF5
+        struct probeunits units;
+        probeunits_find(scene, &c->plan, name, &units);
+        for (char *letter = name; *letter; letter++)
+            if (*letter == '/')
+                *letter = '_'; // a path separator in HDF5
         for (size_t r = 0; r < t.n_rows; r++)
             memcpy(values + r * span, t.values + r * t.n_columns + k, span * sizeof *values);
-        status = store_add_probe(store, name, components, t.n_rows, span, steps, times, values, why,
-                                 why_bytes);
+        const struct store_probe probe = {.name = name,
+                                          .components = components,
+                                          .n_components = span,
+                                          .unit = units.unit,
+                                          .long_name = units.long_name};
+        status = store_add_probe(store, &probe, t.n_rows, steps, times, values, why, why_bytes);
     }
+    cJSON_Delete(scene);
     free(steps);
     free(times);
     free(values);
@@ -337,7 +347,7 @@ static int write_store(struct framelog *log, const struct contents *c, const cha
     if (!store)
         return -1;
     if (write_frames(log, store, c->plan.n_frames, why, why_bytes) != 0 ||
-        write_probes(store, c->probes, why, why_bytes) != 0 ||
+        write_probes(store, c, why, why_bytes) != 0 ||
         write_changes(store, c->changes, why, why_bytes) != 0) {
         store_abandon(store);
         return -1;

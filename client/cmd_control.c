@@ -1,5 +1,6 @@
 // fbar start, pause, resume, step, cancel and delete: actions on a run.
 #include <cjson/cJSON.h>
+#include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
 
@@ -8,6 +9,7 @@
 #include "client/progress.h"
 #include "client/report.h"
 #include "client/request.h"
+#include "client/terminal.h"
 
 static int act(struct client *client, const char *id, const char *action, const char *body) {
     char after[24];
@@ -48,9 +50,19 @@ static int cancel(struct client *client, const struct arguments *arguments) {
 static int step(struct client *client, const struct arguments *arguments) {
     char body[80];
     double steps = 1, until = 0;
-    if (arguments_number(arguments, "steps", 1, 1e15, &steps) != 0 ||
+    const bool counted = arguments->n_positionals > 1;
+    if (counted + arguments_flag(arguments, "steps") + arguments_flag(arguments, "until") > 1) {
+        terminal_error("step takes one of N, --steps N and --until TIME");
+        return CLIENT_USAGE;
+    }
+    if ((counted && arguments_read_number("N", arguments->positionals[1], 1, 1e15, &steps) != 0) ||
+        arguments_number(arguments, "steps", 1, 1e15, &steps) != 0 ||
         arguments_number(arguments, "until", -1e300, 1e300, &until) != 0)
         return CLIENT_USAGE;
+    if (steps != floor(steps)) {
+        terminal_error("the number of steps must be an integer, got %g", steps);
+        return CLIENT_USAGE;
+    }
     if (arguments_flag(arguments, "until"))
         snprintf(body, sizeof body, "{\"until\":%.17g}", until);
     else
@@ -73,22 +85,30 @@ static int delete (struct client *client, const struct arguments *arguments) {
 }
 
 static const struct option_spec step_options[] = {
-    {"steps", 'n', "N", "number of steps (default 1)"},
+    {"steps", 'n', "N", "number of steps (default 1), like N"},
     {"until", 'u', "TIME", "run to this time, s, instead"},
     {NULL, 0, NULL, NULL},
 };
 
-#define ACTION(NAME, FUNCTION, SUMMARY, OPTIONS)                                                   \
+#define ACTION(NAME, FUNCTION, SUMMARY)                                                            \
     const struct command cmd_##NAME = {.name = #NAME,                                              \
                                        .positionals = "RUN",                                       \
                                        .summary = SUMMARY,                                         \
                                        .least = 1,                                                 \
                                        .most = 1,                                                  \
-                                       .options = OPTIONS,                                         \
                                        .run = FUNCTION}
-ACTION(start, start, "start a run that was created without starting", NULL);
-ACTION(pause, hold, "pause a run at the next step", NULL);
-ACTION(resume, resume, "continue a paused run", NULL);
-ACTION(step, step, "run some steps of a paused run, then pause again", step_options);
-ACTION(cancel, cancel, "end a run for good, keeping its frames", NULL);
-ACTION(delete, delete, "remove a finished run and its files", NULL);
+ACTION(start, start, "start a run that was created without starting");
+ACTION(pause, hold, "pause a run at the next step");
+ACTION(resume, resume, "continue a paused run");
+ACTION(cancel, cancel, "end a run for good, keeping its frames");
+ACTION(delete, delete, "remove a finished run and its files");
+
+const struct command cmd_step = {
+    .name = "step",
+    .positionals = "RUN [N]",
+    .summary = "run N steps (1) of a paused run, then pause again",
+    .least = 1,
+    .most = 2,
+    .options = step_options,
+    .run = step,
+};

@@ -149,6 +149,23 @@ static void choose_frames(struct plot *p, bool series) {
     }
 }
 
+// Times that were asked for beyond a recording, by more than half its mean interval of frames.
+static void warn_of_times(const struct plot *p) {
+    for (int k = 0; k < p->n_columns; k++)
+        for (int i = 0; i < p->n_rows; i++) {
+            const struct store_contents *c = p->columns[k].contents;
+            if (c->n_frames == 0)
+                continue;
+            const double asked = p->times[i], last = c->time[c->n_frames - 1];
+            const double half =
+                c->n_frames > 1 ? 0.5 * (last - c->time[0]) / (c->n_frames - 1.0) : 0;
+            if (isfinite(asked) && (asked > last + half || asked < c->time[0] - half))
+                terminal_note(
+                    "warning: %s has no frame near t = %g s; drawing the nearest, t = %.4g s",
+                    p->columns[k].path, asked, c->time[p->frames[k][i]]);
+        }
+}
+
 static int fit_axes(struct plot *p) {
     double longest = 0;
     for (int d = 0; d < 3; d++) {
@@ -399,6 +416,8 @@ static int plot(struct plot *p, const struct client *client, const struct argume
     if (p->n_rows == 0)
         p->times[p->n_rows++] = INFINITY; // the last frame
     choose_frames(p, series != NULL);
+    if (!series)
+        warn_of_times(p);
     const int unread = fit(p);
     if (unread >= 0) {
         terminal_error("%s", p->columns[unread].why);

@@ -69,6 +69,11 @@ static const struct command *find_command(const char *name) {
     return NULL;
 }
 
+static int print_version(void) {
+    puts("fbar " FBARD_VERSION);
+    return CLIENT_DONE;
+}
+
 static const char *first_of(const char *a, const char *b) {
     return a ? a : b;
 }
@@ -115,6 +120,8 @@ int main(int argc, char **argv) {
         return CLIENT_USAGE;
     argc -= used + 1;
     argv += used + 1;
+    if (arguments_flag(&global, "version"))
+        return print_version();
     if (argc == 0 || strcmp(argv[0], "help") == 0) {
         const struct command *command = argc > 1 ? find_command(argv[1]) : NULL;
         if (argc > 1 && !command)
@@ -125,13 +132,13 @@ int main(int argc, char **argv) {
             print_help();
         return argc > 0 || arguments_flag(&global, "help") ? CLIENT_DONE : CLIENT_USAGE;
     }
-    if (strcmp(argv[0], "version") == 0) {
-        puts("fbar " FBARD_VERSION);
-        return CLIENT_DONE;
-    }
+    if (strcmp(argv[0], "version") == 0)
+        return print_version();
     const struct command *command = find_command(argv[0]);
     if (!command || arguments_parse(argc - 1, argv + 1, command, &arguments) < 0)
         return CLIENT_USAGE;
+    if (arguments_flag(&arguments, "version"))
+        return print_version();
     if (arguments_flag(&arguments, "help") || arguments_flag(&global, "help")) {
         print_command_help(command);
         return CLIENT_DONE;

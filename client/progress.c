@@ -65,6 +65,7 @@ static void bar(double fraction, char *out, size_t n) {
 }
 
 void progress_show(const cJSON *run) {
+    static char plain[512]; // what was printed last where there is no terminal
     char line[512], cells[4 * MOST_CELLS + 8] = "", eta[32], speed[48] = "", state[32] = "";
     const double fraction = fmin(fmax(number(run, "progress"), 0), 1);
     const double rate =
@@ -85,8 +86,10 @@ void progress_show(const cJSON *run) {
              cJSON_IsTrue(fbar) || cJSON_IsObject(fbar) ? "on" : "off", state, speed);
     if (live)
         terminal_status(line);
-    else
+    else if (strcmp(line, plain) != 0)
         fprintf(stderr, "%s\n", line);
+    if (!live)
+        snprintf(plain, sizeof plain, "%s", line);
 }
 
 void progress_end(void) {

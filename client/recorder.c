@@ -161,12 +161,7 @@ static void acknowledge(struct recorder *r, uint64_t next) {
         if (reply.status >= 200 && reply.status < 300) {
             r->registered = true;
         } else if (!r->registered && reply.status < 500) {
-            r->no_recorders = true;
-            if (!r->options->on_interrupt) // `fbar run` is beside its run all the time
-                terminal_note(
-                    "this daemon knows no recorders (%ld): it may drop frames that are not "
-                    "here yet",
-                    reply.status);
+            r->no_recorders = true; // of interest only once a frame is gone
         }
         request_reply_free(&reply);
     }
@@ -258,9 +253,10 @@ static enum outcome fetch_until(struct recorder *r, uint64_t until) {
     while (r->next < until && !r->ended) {
         const enum outcome outcome = fetch_next(r);
         if (outcome == OVER) {
-            terminal_error("frame %llu of %s is gone from the daemon; the recording cannot be "
+            terminal_error("frame %llu of %s is gone from the daemon%s; the recording cannot be "
                            "completed",
-                           (unsigned long long)r->next, r->options->run);
+                           (unsigned long long)r->next, r->options->run,
+                           r->no_recorders ? ", which keeps no frames for recorders" : "");
             return LOST;
         }
         if (outcome != GOOD)

@@ -22,28 +22,38 @@ static const uint32_t fill_integer = 0;
 
 static const char *const topologies[] = {"Vertices", "Lines", "Polygons", "Strips"};
 
-// What each array is, for people; names that are not listed get their name with blanks.
+// What each array is, for people, and its unit where no frame says it; names that are not listed
+// get their name with blanks.
 static const struct {
-    const char *name, *text;
-} long_names[] = {
-    {"position", "current position (z = 0 in 2D)"},
-    {"velocity", "velocity"},
-    {"displacement", "current less reference position"},
-    {"mean_stress", "mean normal stress tr(sigma)/3 with sigma33, tension positive"},
-    {"stress", "Cauchy stress, row by row, tension positive (2D: in-plane components, the rest 0)"},
-    {"von_mises", "von Mises equivalent stress"},
-    {"volume_ratio", "volume ratio J of the unaveraged deformation"},
-    {"volume_ratio_bar", "volume ratio that the stress uses (J-bar with F-bar on)"},
-    {"plastic_strain", "equivalent plastic strain"},
-    {"density", "current density"},
-    {"body", "index of the body in the scene's order"},
-    {"id", "number of the particle, stable over the run"},
+    const char *name, *unit, *text;
+} known_fields[] = {
+    {"position", "m", "current position (z = 0 in 2D)"},
+    {"velocity", "m/s", "velocity"},
+    {"displacement", "m", "current less reference position"},
+    {"mean_stress", "Pa", "mean normal stress tr(sigma)/3 with sigma33, tension positive"},
+    {"stress", "Pa",
+     "Cauchy stress, row by row, tension positive (2D: in-plane components, the rest 0)"},
+    {"von_mises", "Pa", "von Mises equivalent stress"},
+    {"volume_ratio", "1", "volume ratio J of the unaveraged deformation"},
+    {"volume_ratio_bar", "1", "volume ratio that the stress uses (J-bar with F-bar on)"},
+    {"plastic_strain", "1", "equivalent plastic strain"},
+    {"density", "kg/m^3", "current density"},
+    {"body", "1", "index of the body in the scene's order"},
+    {"id", "1", "number of the particle, stable over the run"},
 };
+#define N_KNOWN_FIELDS (sizeof known_fields / sizeof *known_fields)
+
+const char *store_field_unit(const char *name) {
+    for (size_t i = 0; i < N_KNOWN_FIELDS; i++)
+        if (strcmp(name, known_fields[i].name) == 0)
+            return known_fields[i].unit;
+    return "unknown";
+}
 
 static const char *long_name(const char *name, char *buffer, size_t n) {
-    for (size_t i = 0; i < sizeof long_names / sizeof *long_names; i++)
-        if (strcmp(name, long_names[i].name) == 0)
-            return long_names[i].text;
+    for (size_t i = 0; i < N_KNOWN_FIELDS; i++)
+        if (strcmp(name, known_fields[i].name) == 0)
+            return known_fields[i].text;
     snprintf(buffer, n, "%s", name);
     for (char *c = buffer; *c; c++)
         if (*c == '_')
@@ -435,13 +445,13 @@ int store_add_frame(struct store *s, const struct frameinfo *info, const void *f
     return 0;
 }
 
-int store_add_probe(struct store *s, const char *name, const char *components, size_t n,
-                    size_t n_components, const uint64_t *steps, const double *times,
-                    const double *values, char *why, size_t why_bytes) {
-    const hid_t group = make_group(s->probes, name);
+int store_add_probe(struct store *s, const struct store_probe *probe, size_t n,
+                    const uint64_t *steps, const double *times, const double *values, char *why,
+                    size_t why_bytes) {
+    const hid_t group = make_group(s->probes, probe->name);
     if (group < 0)
         return fail(s->path, why, why_bytes);
-    int status = put_text(group, "components", components);
+    int status = put_text(group, "components", probe->components);
     if (status == 0)
         status = put_dataset(group, "step", H5T_STD_I64LE, H5T_NATIVE_UINT64, n, 0, steps, "1",
                              "steps done");
@@ -450,7 +460,8 @@ int store_add_probe(struct store *s, const char *name, const char *components, s
                              "time since the start of the last stage");
     if (status == 0)
         status = put_dataset(group, "value", H5T_IEEE_F64LE, H5T_NATIVE_DOUBLE, n,
-                             n_components > 1 ? n_components : 0, values, "SI", name);
+                             probe->n_components > 1 ? probe->n_components : 0, values, probe->unit,
+                             probe->long_name);
     if (H5Gclose(group) < 0)
         status = -1;
     return status == 0 ? 0 : fail(s->path, why, why_bytes);

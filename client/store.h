@@ -32,12 +32,21 @@ struct store_plan {
 int store_plan_add(struct store_plan *plan, const struct frameinfo *info, char *why,
                    size_t why_bytes);
 
+// The unit of a field that no frame has; "unknown" where this version does not know it.
+const char *store_field_unit(const char *name);
+
 struct store_about {
     const char *run, *code_version; // borrowed
     const char *scene;              // JSON text, or NULL
     const char *state;              // of the run, as in its last frame
     bool complete;                  // all frames of the run are here
     int compress;                   // 0, or the deflate level
+};
+
+struct store_probe {
+    const char *name, *components; // borrowed; component names are joined by commas
+    size_t n_components;
+    const char *unit, *long_name;
 };
 
 struct store;
@@ -48,10 +57,10 @@ struct store *store_create(const char *path, const struct store_plan *plan,
 // Frames in the order of their seq; as many as the plan counts.
 int store_add_frame(struct store *store, const struct frameinfo *info, const void *frame, char *why,
                     size_t why_bytes);
-// One probe: `values` is (n, components), row by row; component names are joined by commas.
-int store_add_probe(struct store *store, const char *name, const char *components, size_t n,
-                    size_t n_components, const uint64_t *steps, const double *times,
-                    const double *values, char *why, size_t why_bytes);
+// One probe: `values` is (n, n_components), row by row.
+int store_add_probe(struct store *store, const struct store_probe *probe, size_t n,
+                    const uint64_t *steps, const double *times, const double *values, char *why,
+                    size_t why_bytes);
 // All parameter changes: (n) each; `patches` are JSON texts.
 int store_add_changes(struct store *store, size_t n, const uint64_t *steps, const double *times,
                       const char *const *patches, char *why, size_t why_bytes);

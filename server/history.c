@@ -132,7 +132,10 @@ cJSON *history_error(const struct run_error *error) {
         add(json, "particle", (double)error->particle);
     else
         cJSON_AddNullToObject(json, "particle");
-    cJSON_AddStringToObject(json, "quantity", error->quantity);
+    if (error->quantity[0] != '\0')
+        cJSON_AddStringToObject(json, "quantity", error->quantity);
+    else
+        cJSON_AddNullToObject(json, "quantity");
     add(json, "value", error->value);
     cJSON_AddStringToObject(json, "advice", error->advice);
     cJSON_AddStringToObject(json, "detail", error->detail);
@@ -232,6 +235,7 @@ static bool change_add(struct history *out, uint64_t number_of_line, const cJSON
     out->changes[out->n_changes++] =
         (struct history_change){.number = number_of_line,
                                 .step = (uint64_t)fmax(number(event, "step", 0), 0),
+                                .time = number(event, "time", NAN),
                                 .frames = (uint64_t)fmax(number(event, "frames", 0), 0),
                                 .patch = cJSON_Duplicate(json_member(event, "patch"), true)};
     return true;
@@ -258,6 +262,14 @@ static bool event_read(struct history *out, uint64_t line, const cJSON *event) {
         out->epoch = (uint64_t)fmax(number(event, "epoch", 0), 0);
     }
     return true;
+}
+
+cJSON *history_change_json(uint64_t step, double time, cJSON *patch) {
+    cJSON *json = cJSON_CreateObject();
+    add(json, "step", (double)step);
+    add(json, "time", time);
+    cJSON_AddItemToObject(json, "patch", patch);
+    return json;
 }
 
 bool history_read(const char *given, size_t bytes, struct history *out, char *why) {

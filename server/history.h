@@ -31,6 +31,7 @@ cJSON *history_error(const struct run_error *error); // null when there is none
 struct history_change {
     uint64_t number; // of its line, from 0
     uint64_t step;   // took effect after this many steps
+    double time;     // s
     uint64_t frames; // frames taken by then
     cJSON *patch;
 };
@@ -44,6 +45,8 @@ struct history {
     struct history_change *changes;
     uint64_t epoch; // the newest one begun
 };
+// {"step", "time", "patch"} of a change, as the API tells it; takes the patch.
+cJSON *history_change_json(uint64_t step, double time, cJSON *patch);
 // False when a line is no event; `why` (JOURNAL_WHY bytes) names it.
 bool history_read(const char *text, size_t bytes, struct history *out, char *why);
 void history_free(struct history *history);

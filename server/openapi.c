@@ -66,7 +66,8 @@ static const struct {
      "\":{\"name\":{\"type\":\"string\"},\"title\":{\"type\":\"string\"}}}}}}"},
     {"Validate", "{\"type\":\"object\",\"description\":\"a bare scene, or {scene, overrides}\"}"},
     {"Valid",
-     "{\"type\":\"object\",\"required\":[\"valid\",\"estimate\"],\"properties\":{\"valid\":{"
+     "{\"type\":\"object\",\"required\":[\"valid\",\"estimate\",\"warnings\"],\"properties\":{"
+     "\"warnings\":{\"type\":\"array\",\"items\":{\"type\":\"string\"}},\"valid\":{"
      "\"const\":true},\"estimate\":{\"type\":\"object\",\"required\":[\"particles\",\"nodes"
      "\",\"dt\",\"dt_limit\",\"steps\",\"bytes\"],\"properties\":{\"particles\":{\"type\":\""
      "integer\"},\"nodes\":{\"type\":\"integer\"},\"dt\":{\"type\":\"number\"},\"dt_limit\":"
@@ -84,7 +85,8 @@ static const struct {
      "ncelled\"]}"},
     {"Run", "{\"type\":\"object\",\"required\":[\"id\",\"state\",\"step\",\"time\",\"end_time\",\"p"
             "rogress\",\"eta_s\",\"dt\",\"fbar\",\"particles\",\"scene\",\"created\",\"error\",\"wa"
-            "rnings\",\"performance\",\"balance\",\"probes\",\"accuracy\"],\"properties\":{\"id\":{"
+            "rnings\",\"changes\",\"performance\",\"balance\",\"probes\",\"accuracy\"],"
+            "\"properties\":{\"id\":{"
             "\"type\":\"string\"},\"state\":{\"$ref\":\"#/components/schemas/State\"},\"step\":{\"t"
             "ype\":\"integer\"},\"time\":{\"$ref\":\"#/components/schemas/Number\"},\"end_time\":{"
             "\"$ref\":\"#/components/schemas/Number\"},\"progress\":{\"type\":\"number\",\"minimum"
@@ -92,7 +94,10 @@ static const struct {
             "f\":\"#/components/schemas/Number\"},\"fbar\":{\"type\":\"boolean\"},\"fbar_scheme\":{"
             "\"type\":\"string\"},\"particles\":{\"type\":\"integer\"},\"scene\":{\"type\":\"string"
             "\"},\"created\":{\"type\":\"string\"},\"error\":{\"type\":[\"object\",\"null\"]},\"war"
-            "nings\":{\"type\":\"array\",\"items\":{\"type\":\"string\"}},\"performance\":{\"type\""
+            "nings\":{\"type\":\"array\",\"items\":{\"type\":\"string\"}},\"changes\":{\"type\":"
+            "\"array\",\"items\":{\"type\":\"object\",\"required\":[\"step\",\"time\",\"patch\"],"
+            "\"properties\":{\"step\":{\"type\":\"integer\"},\"time\":{\"$ref\":\"#/components/"
+            "schemas/Number\"},\"patch\":{\"type\":\"object\"}}}},\"performance\":{\"type\""
             ":\"object\",\"required\":[\"wall_s\",\"particle_steps_per_s\",\"bytes_per_particle\","
             "\"phases\"],\"properties\":{\"wall_s\":{\"type\":\"number\"},\"particle_steps_per_s\":"
             "{\"$ref\":\"#/components/schemas/Number\"},\"bytes_per_particle\":{\"$ref\":\"#/compon"

@@ -130,8 +130,9 @@ static bool parse_resume(const char *text, enum options_resume *out) {
     X(DATA_DIR, "--data-dir", "DIR", "one folder a run ($XDG_STATE_HOME/fbard)")                   \
     X(THREADS, "--threads", "N", "solver threads of a run (cores / slots)")                        \
     X(SLOTS, "--slots", "N", "runs at a time (1)")                                                 \
-    X(QUEUE, "--queue", "N", "runs that may wait for a slot (64)")                                 \
-    X(RESUME, "--resume", "auto|paused|off", "what becomes of runs that were running (auto)")      \
+    X(QUEUE, "--queue", "N", "unfinished runs beyond --slots, paused ones included (64)")          \
+    X(RESUME, "--resume", "auto|paused|off",                                                       \
+      "runs that were running: go on, pause, or wait for auto (auto)")                             \
     X(TOKEN_FILE, "--token-file", "FILE", "every request must carry this bearer token")            \
     X(TLS_CERT, "--tls-cert", "FILE", "serve HTTPS with this certificate (PEM)")                   \
     X(TLS_KEY, "--tls-key", "FILE", "its key (PEM)")                                               \

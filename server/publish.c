@@ -21,6 +21,7 @@
 #define SEND_HIGH_WATER 8 // messages a subscriber may lag before it loses some
 #define LINGER_MS 1000
 #define RETRY_SECONDS 0.5 // between two tries on a full disk
+#define LOG_SECONDS 60    // between two lines about the same trouble
 #define EVENTS_MAX 256    // queued events of a run; the log has them all
 
 struct item {
@@ -45,7 +46,7 @@ struct outlet {
     unsigned n_frames, n_events;
     bool busy; // the thread is at work on one of its items
     enum journal_result status;
-    struct timespec retry;
+    struct timespec retry, log_again;
     char why[JOURNAL_WHY];
 };
 
@@ -57,7 +58,6 @@ struct publisher {
     struct outlet *outlets;
     struct outlet *turn; // whose item was taken last
     bool stop;
-    struct publish_counts counts;
 };
 
 // ---- Buffers ----------------------------------------------------------------------------------
@@ -167,7 +167,8 @@ static struct outlet *next_outlet(struct publisher *p) {
 static void work_on(struct publisher *p, struct outlet *o) {
     struct item *item = o->first;
     enum journal_result result = JOURNAL_OK;
-    char why[JOURNAL_WHY] = "";
+    char why[JOURNAL_WHY] = "", before[JOURNAL_WHY];
+    memcpy(before, o->why, sizeof before);
     o->busy = true;
     p->turn = o;
     pthread_mutex_unlock(&p->lock);
@@ -179,7 +180,8 @@ static void work_on(struct publisher *p, struct outlet *o) {
         if (result == JOURNAL_OK) {
             announce_gone(p, o, gone);
             send_frame(p, o, item->frame);
-        } else {
+        } else if (strcmp(why, before) != 0 || is_past(&o->log_again)) {
+            o->log_again = after(LOG_SECONDS);
             log_error("journal", "topic=%s seq=%llu full=%d why=\"%s\"", o->frame_topic,
                       (unsigned long long)frame->info.seq, result == JOURNAL_FULL, why);
         }
@@ -196,12 +198,9 @@ static void work_on(struct publisher *p, struct outlet *o) {
             o->last = NULL;
         if (item->frame != NULL) {
             o->n_frames--;
-            p->counts.frames++;
-            p->counts.bytes += item->frame->public.info.bytes;
             buffer_release(item->frame);
         } else {
             o->n_events--;
-            p->counts.events++;
             free(item->event);
         }
         free(item);
@@ -298,13 +297,6 @@ void publish_stop(struct publisher *p) {
     pthread_cond_destroy(&p->done);
     pthread_mutex_destroy(&p->lock);
     free(p);
-}
-
-struct publish_counts publish_counts_now(struct publisher *p) {
-    pthread_mutex_lock(&p->lock);
-    struct publish_counts counts = p->counts;
-    pthread_mutex_unlock(&p->lock);
-    return counts;
 }
 
 // ---- Outlets ----------------------------------------------------------------------------------

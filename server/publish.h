@@ -54,8 +54,3 @@ enum journal_result publish_status(struct outlet *outlet, char *why);
 // Waits until all that was pushed is in the journal and handed to the socket; false when it is not
 // within `seconds` (< 0: as long as it takes) or the writing failed.
 bool publish_flush(struct outlet *outlet, double seconds);
-
-struct publish_counts {
-    uint64_t frames, bytes, events; // handed to the socket since the start
-};
-struct publish_counts publish_counts_now(struct publisher *publisher);

@@ -37,8 +37,11 @@ void routes_serve_validate(struct call *c);
 
 // The run that the path names, retained; NULL when the reply is a 404.
 struct run *routes_run_of(struct call *c);
-// A fault for every key of `body` that is not in `known` (" one two ").
+// A fault for every key of `body` that is not in `known` ("one two").
 void routes_unknown_keys(const cJSON *body, const char *known, struct faults *faults);
+// "must be EXPECTED, got ..." of a member of the body.
+void routes_value_fault(struct faults *faults, const char *key, const char *code,
+                        const char *expected, const cJSON *value);
 const char *routes_type_name(const cJSON *item);
 // {"scene": name or object, "overrides": object}: the merged scene, new; NULL with faults.
 cJSON *routes_merged_scene(const cJSON *body, struct faults *faults);

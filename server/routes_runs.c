@@ -124,6 +124,7 @@ static cJSON *run_json(struct run *run) {
     warnings = cJSON_AddArrayToObject(json, "warnings");
     for (unsigned k = 0; k < status.n_warnings; k++)
         cJSON_AddItemToArray(warnings, cJSON_CreateString(status.warnings[k]));
+    cJSON_AddItemToObject(json, "changes", run_changes(run));
     cJSON_AddItemToObject(json, "performance", performance_json(&status));
     cJSON_AddItemToObject(json, "balance", balance_json(&status));
     cJSON_AddItemToObject(
@@ -185,14 +186,11 @@ void routes_serve_delete(struct call *c) {
 static void check_create(const cJSON *body, struct run_definition *out, struct faults *faults) {
     const cJSON *id = json_member(body, "id"), *start = json_member(body, "start");
     const cJSON *wait = json_member(body, "wait_subscribers");
-    routes_unknown_keys(body, " scene overrides id start wait_subscribers ", faults);
+    routes_unknown_keys(body, "scene overrides id start wait_subscribers", faults);
     if (id != NULL && !cJSON_IsString(id))
         faults_add(faults, "/id", "type", "string", routes_type_name(id), "must be a string");
     else if (id != NULL && !runs_id_valid(id->valuestring))
-        faults_add(faults, "/id", "pattern", "[A-Za-z0-9][A-Za-z0-9._-]{0,63}", NULL,
-                   "must begin with a letter or digit and have at most %d letters, digits, dots, "
-                   "dashes and underscores",
-                   RUN_ID_MAX);
+        routes_value_fault(faults, "id", "pattern", "[A-Za-z0-9][A-Za-z0-9._-]{0,63}", id);
     else if (id != NULL)
         out->id = id->valuestring;
     if (start != NULL && !cJSON_IsBool(start))
@@ -203,11 +201,10 @@ static void check_create(const cJSON *body, struct run_definition *out, struct f
         return;
     if (!cJSON_IsNumber(wait) || wait->valuedouble < 0 ||
         wait->valuedouble != floor(wait->valuedouble))
-        faults_add(faults, "/wait_subscribers", "type", "integer >= 0", routes_type_name(wait),
-                   "must be a whole number, 0 or more");
+        routes_value_fault(faults, "wait_subscribers", "type", "a whole number, 0 or more", wait);
     else if (wait->valuedouble != 0)
-        faults_add(faults, "/wait_subscribers", "unsupported", "0", NULL,
-                   "this version does not wait for subscribers");
+        routes_value_fault(faults, "wait_subscribers", "unsupported",
+                           "0 (this version does not wait for subscribers)", wait);
 }
 
 static void reply_created(struct call *c, struct run *run) {
@@ -262,18 +259,16 @@ done:
 
 static bool step_body(const cJSON *body, struct run_command *command, struct faults *faults) {
     const cJSON *steps = json_member(body, "steps"), *until = json_member(body, "until");
-    routes_unknown_keys(body, " steps until ", faults);
+    routes_unknown_keys(body, "steps until", faults);
     if ((steps != NULL) == (until != NULL))
         faults_add(faults, "", steps == NULL ? "required" : "conflict", "steps or until", NULL,
                    "must have one of steps and until");
     if (steps != NULL && (!cJSON_IsNumber(steps) || steps->valuedouble < 1 ||
                           steps->valuedouble != floor(steps->valuedouble)))
-        faults_add(faults, "/steps", cJSON_IsNumber(steps) ? "range" : "type", "integer >= 1",
-                   cJSON_IsNumber(steps) ? NULL : routes_type_name(steps),
-                   "must be a whole number, 1 or more");
+        routes_value_fault(faults, "steps", cJSON_IsNumber(steps) ? "range" : "type",
+                           "a whole number, 1 or more", steps);
     if (until != NULL && !cJSON_IsNumber(until))
-        faults_add(faults, "/until", "type", "number", routes_type_name(until),
-                   "must be a time in s");
+        routes_value_fault(faults, "until", "type", "a time in s", until);
     if (faults->count > 0)
         return false;
     // 2^53: beyond that a double holds no whole numbers, and no run does as many steps
@@ -284,13 +279,15 @@ static bool step_body(const cJSON *body, struct run_command *command, struct fau
 
 // The reply to a command that was not carried out.
 static void refuse(struct call *c, const struct run_command *command) {
-    const char *name = run_action_name(command->action);
+    bool configures = command->action == RUN_DO_CONFIGURE;
     switch (command->outcome) {
     case RUN_DONE:
         break;
     case RUN_ILLEGAL:
-        reply_problem(c->reply, 409, NULL, "run %.80s is %s: it cannot %s", c->names[0],
-                      run_state_name(command->state), name);
+        reply_problem(c->reply, 409, NULL, "run %.80s is %s: %s %s", c->names[0],
+                      run_state_name(command->state),
+                      configures ? "its configuration cannot" : "it cannot",
+                      configures ? "change" : run_action_name(command->action));
         break;
     case RUN_INVALID:
         reply_faults(c->reply, 422, &command->faults);
@@ -320,7 +317,7 @@ void routes_serve_action(struct call *c) {
     if (command.action == RUN_DO_STEP)
         step_body(c->body, &command, &faults);
     else
-        routes_unknown_keys(c->body, " ", &faults);
+        routes_unknown_keys(c->body, "", &faults);
     if (faults.count > 0) {
         reply_faults(c->reply, 422, &faults);
     } else {

@@ -4,6 +4,7 @@
 
 #include "server/openapi.h"
 #include "server/routes_inside.h"
+#include "server/scene_fault.h"
 
 // ---- The daemon itself ------------------------------------------------------------------------
 
@@ -115,16 +116,36 @@ const char *routes_type_name(const cJSON *item) {
                                   : "null";
 }
 
+void routes_value_fault(struct faults *faults, const char *key, const char *code,
+                        const char *expected, const cJSON *value) {
+    struct scene_cursor root = {0}, at = {.parent = &root, .key = key};
+    scene_value_fault(faults, &at, code, expected, value);
+}
+
 void routes_unknown_keys(const cJSON *body, const char *known, struct faults *faults) {
+    char words[128], expected[160], *names[8];
+    size_t n = 0;
+    snprintf(words, sizeof words, "%s", known);
+    for (char *rest = words, *word; (word = strsep(&rest, " ")) != NULL;)
+        if (word[0] != '\0' && n < sizeof names / sizeof *names)
+            names[n++] = word;
+    snprintf(expected, sizeof expected, "%s", n == 0 ? "no keys" : "one of");
+    for (size_t k = 0; k < n; k++) {
+        size_t length = strlen(expected);
+        snprintf(expected + length, sizeof expected - length, "%s%s", k == 0 ? " " : ", ",
+                 names[k]);
+    }
     const cJSON *item;
     cJSON_ArrayForEach(item, body) {
-        char pointer[300] = "", word[80];
-        snprintf(word, sizeof word, " %.70s ", item->string);
-        if (strchr(item->string, ' ') == NULL && strstr(known, word) != NULL)
-            continue;
-        json_pointer_append(pointer, sizeof pointer, item->string);
-        faults_add(faults, pointer, "unknown_key", known + 1, item->string,
-                   "unknown key; the keys here are:%s", known);
+        struct scene_cursor root = {0}, at = {.parent = &root, .key = item->string};
+        struct scene_suggestion s = {.word = item->string};
+        bool is_known = false;
+        for (size_t k = 0; k < n; k++) {
+            is_known = is_known || strcmp(names[k], item->string) == 0;
+            scene_suggest(&s, names[k]);
+        }
+        if (!is_known)
+            scene_unknown_fault(faults, &at, "unknown_key", expected, "there is no key", &s);
     }
 }
 
@@ -223,13 +244,23 @@ struct scene *routes_checked_scene(const struct call *c, const cJSON *json, cons
     return scene;
 }
 
+// What a run of the scene would be warned of.
+static void add_warnings(cJSON *json, struct scene *scene, const struct mpm_estimate *estimate) {
+    struct run_status status = {.dt = estimate->dt, .dt_limit = estimate->dt_limit};
+    status.fbar = scene_config(scene)->settings.fbar.scheme != MPM_FBAR_OFF;
+    run_warn_scene(&status, scene_def(scene));
+    cJSON *list = cJSON_AddArrayToObject(json, "warnings");
+    for (unsigned k = 0; k < status.n_warnings; k++)
+        cJSON_AddItemToArray(list, cJSON_CreateString(status.warnings[k]));
+}
+
 void routes_serve_validate(struct call *c) {
     struct faults faults = {0};
     struct mpm_estimate estimate;
     bool bare = json_member(c->body, "scene") == NULL;
     cJSON *merged = NULL;
     if (!bare) {
-        routes_unknown_keys(c->body, " scene overrides ", &faults);
+        routes_unknown_keys(c->body, "scene overrides", &faults);
         merged = routes_merged_scene(c->body, &faults);
     }
     struct scene *scene = NULL;
@@ -248,6 +279,7 @@ void routes_serve_validate(struct call *c) {
         reply_add(costs, "dt_limit", estimate.dt_limit);
         reply_add(costs, "steps", (double)estimate.steps);
         reply_add(costs, "bytes", (double)estimate.bytes);
+        add_warnings(json, scene, &estimate);
         reply_json(c->reply, 200, json);
     }
     scene_free(scene);

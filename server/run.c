@@ -66,6 +66,14 @@ void run_warn(struct run_status *status, const char *format, ...) {
         memcpy(status->warnings[status->n_warnings++], text, sizeof text);
 }
 
+void run_unwarn(struct run_status *status, const char *beginning) {
+    unsigned kept = 0;
+    for (unsigned k = 0; k < status->n_warnings; k++)
+        if (strncmp(status->warnings[k], beginning, strlen(beginning)) != 0)
+            memmove(status->warnings[kept++], status->warnings[k], sizeof status->warnings[0]);
+    status->n_warnings = kept;
+}
+
 // ---- States -----------------------------------------------------------------------------------
 
 enum run_verdict run_verdict(enum run_action action, enum run_state state) {
@@ -130,6 +138,13 @@ char *run_config_text(struct run *r, uint64_t *revision) {
     *revision = r->status.revision;
     pthread_mutex_unlock(&r->lock);
     return text;
+}
+
+cJSON *run_changes(struct run *r) {
+    pthread_mutex_lock(&r->lock);
+    cJSON *changes = cJSON_Duplicate(r->changes, true);
+    pthread_mutex_unlock(&r->lock);
+    return changes;
 }
 
 // ---- Commands ---------------------------------------------------------------------------------
@@ -200,6 +215,7 @@ static struct run *run_new(const struct run_host *host, const char *id) {
     pthread_mutex_init(&r->lock, NULL);
     atomic_init(&r->references, 1);
     r->host = host;
+    r->changes = cJSON_CreateArray();
     snprintf(r->id, sizeof r->id, "%s", id);
     r->slot = (struct slot){.wake = wake, .context = r};
     r->now = (struct run_status){.state = RUN_PAUSED, .eta_s = NAN, .error.particle = -1};
@@ -234,6 +250,7 @@ static void run_free(struct run *r) {
     cJSON_Delete(r->scene_json);
     series_free(r->series);
     journal_close(r->journal);
+    cJSON_Delete(r->changes);
     cJSON_Delete(r->replay.scene);
     history_free(&r->history);
     history_meta_free(&r->meta);
@@ -446,6 +463,9 @@ static void restore_changes(struct run *r) {
             r->scene_json = patched;
             r->config = config;
         }
+        const struct history_change *change = &r->history.changes[k];
+        cJSON_AddItemToArray(r->changes, history_change_json(change->step, change->time,
+                                                             cJSON_Duplicate(change->patch, true)));
         faults_free(&faults);
     }
     r->now.revision = r->history.n_changes;

@@ -21,8 +21,8 @@
 #define RUN_STATE_LIST(X)                                                                          \
     X(QUEUED, "queued")                                                                            \
     X(RUNNING, "running")                                                                          \
-    X(WAITING, "waiting") X(PAUSED, "paused") X(COMPLETED, "completed") X(FAILED, "failed")        \
-        X(CANCELLED, "cancelled")
+    X(WAITING, "waiting")                                                                          \
+    X(PAUSED, "paused") X(COMPLETED, "completed") X(FAILED, "failed") X(CANCELLED, "cancelled")
 enum run_state {
 #define X(code, text) RUN_##code,
     RUN_STATE_LIST(X)
@@ -36,8 +36,10 @@ bool run_state_is_final(enum run_state state);
 #define RUN_ACTION_LIST(X)                                                                         \
     X(START, "start")                                                                              \
     X(PAUSE, "pause")                                                                              \
-    X(RESUME, "resume") X(STEP, "step") X(CANCEL, "cancel") X(CHECKPOINT, "checkpoint")            \
-        X(SNAPSHOT, "snapshot") X(CONFIGURE, "configure")
+    X(RESUME, "resume")                                                                            \
+    X(STEP, "step")                                                                                \
+    X(CANCEL, "cancel")                                                                            \
+    X(CHECKPOINT, "checkpoint") X(SNAPSHOT, "snapshot") X(CONFIGURE, "configure")
 enum run_action {
 #define X(code, text) RUN_DO_##code,
     RUN_ACTION_LIST(X)
@@ -108,6 +110,9 @@ struct run_host {
     size_t memory_limit;
 };
 
+// The warnings that the scene alone calls for, of the F-bar, dt and dt_limit in `status`.
+void run_warn_scene(struct run_status *status, const struct mpm_def *def);
+
 struct run;
 
 struct run_definition {
@@ -137,8 +142,9 @@ const char *run_created(const struct run *run); // RFC 3339
 struct run_status run_status(struct run *run);
 char *run_scene_text(struct run *run);                      // JSON as run; the caller frees it
 char *run_config_text(struct run *run, uint64_t *revision); // the settable part of it
-struct series *run_series(struct run *run);                 // NULL before there are probes
-struct journal *run_journal(struct run *run);               // NULL when its folder is damaged
+cJSON *run_changes(struct run *run);          // [{step, time, patch}] of the configuration; new
+struct series *run_series(struct run *run);   // NULL before there are probes
+struct journal *run_journal(struct run *run); // NULL when its folder is damaged
 const struct run_reference *run_references(const struct run *run, size_t *count);
 
 enum run_outcome {

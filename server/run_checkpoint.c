@@ -50,6 +50,7 @@ enum journal_result run_checkpoint(struct run *r, char *why) {
         r->has_checkpoint = true;
         r->checkpoint_step = r->now.step;
         r->checkpoint_revision = r->now.revision;
+        run_unwarn(&r->now, "the last checkpoint failed");
     } else {
         run_warn(&r->now, "the last checkpoint failed: %.150s", why);
         log_error("checkpoint", "run=%s why=\"%s\"", r->id, why);

@@ -36,6 +36,7 @@ struct run {
     bool accepts;             // commands are still being answered
     struct run_status status; // the copy that others read
     char *scene_text, *config_text;
+    cJSON *changes;        // of the configuration, as the API tells them
     struct series *series; // set once
 
     atomic_bool knock; // look at the queue, the slot or the outlet
@@ -85,6 +86,8 @@ void run_boundary(struct run *run);
 void run_describe(struct run *run);
 void run_warn(struct run_status *status, const char *format, ...)
     __attribute__((format(printf, 2, 3)));
+// Drops the warnings that begin so: what they tell of is over.
+void run_unwarn(struct run_status *status, const char *beginning);
 void run_account(struct run *run, enum run_phase phase,
                  double since);       // seconds, inside the step loop
 void run_wall_enter(struct run *run); // the step loop

@@ -14,6 +14,7 @@
 #include "server/log.h"
 #include "server/run_inside.h"
 
+#define WARNING_DISK "waits for room on the disk"
 #define PUBLISH_SECONDS 0.02 // between two copies of the status
 #define WAITING_SECONDS 0.25 // a shorter wait for the disk is not worth a change of state
 #define CHECKPOINT_FLUSH 5.0 // s to wait for frames on their way before a checkpoint is given up
@@ -104,11 +105,11 @@ static enum run_outcome step_run(struct run *r, struct run_command *c) {
     }
     if (c->steps == 0 && c->until <= mpm_time(r->sim)) {
         char expected[64], actual[64];
-        snprintf(expected, sizeof expected, "> %.9g s", mpm_time(r->sim));
+        double now = mpm_time(r->sim) + 0.0; // no -0
+        snprintf(expected, sizeof expected, "> %.9g s", now);
         snprintf(actual, sizeof actual, "%.9g s", c->until);
         faults_add(&c->faults, "/until", "range", expected, actual,
-                   "must lie after the present time %.9g s, got %.9g s", mpm_time(r->sim),
-                   c->until);
+                   "must lie after the present time %.9g s, got %.9g s", now, c->until);
         return RUN_INVALID;
     }
     uint64_t at = mpm_step_count(r->sim);
@@ -269,6 +270,7 @@ static void finish(struct run *r) {
     if (!r->end_pushed || (!publish_flush(r->outlet, 0) && !forced))
         return;
     run_wall_leave(r);
+    run_unwarn(&r->now, WARNING_DISK);
     run_status_fill(r, r->ending != RUN_FAILED);
     struct run_status last = run_status_until_now(r);
     last.state = r->ending;
@@ -318,7 +320,7 @@ static void wait_for_disk(struct run *r) {
         run_fail(r, "journal", "make room on the disk, or set output.when_full to \"block\"", why);
     } else {
         if (status == JOURNAL_FULL)
-            run_warn(&r->now, "waits for room on the disk: %.150s", why);
+            run_warn(&r->now, WARNING_DISK ": %.150s", why);
         if (r->now.state == RUN_RUNNING && run_clock() - r->wait_from > WAITING_SECONDS)
             run_state_enter(r, RUN_WAITING);
         wait_for_knock(r, 0.05);
@@ -336,6 +338,7 @@ static void advance(struct run *r) {
             wait_for_disk(r);
             return;
         }
+        run_unwarn(&r->now, WARNING_DISK);
     }
     if (r->now.state == RUN_WAITING)
         run_state_enter(r, RUN_RUNNING);
@@ -393,6 +396,8 @@ static void turn(struct run *r) {
         } else {
             if (r->due && r->sim != NULL)
                 run_boundary(r);
+            if (!r->due)
+                run_unwarn(&r->now, WARNING_DISK);
             wait_for_knock(r, r->due ? 0.2 : 60);
         }
         break;

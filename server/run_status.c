@@ -47,6 +47,28 @@ void run_wall_wait(struct run *r) {
 
 // ---- Status -----------------------------------------------------------------------------------
 
+void run_warn_scene(struct run_status *now, const struct mpm_def *def) {
+    for (size_t k = 0; now->fbar && k < def->n_materials; k++) {
+        const struct mpm_material_def *material = &def->materials[k];
+        const struct mpm_parameter *parameter;
+        for (size_t p = 0; p < MPM_MAX_PARAMETERS &&
+                           (parameter = mpm_material_parameter(material->model, p)) != NULL;
+             p++)
+            if (material->fbar && strcmp(parameter->key, "poisson_ratio") == 0 &&
+                material->parameters[p] < RATIO_COMPRESSIBLE)
+                run_warn(now,
+                         "F-bar is on for the compressible material %.60s (poisson_ratio %g): it "
+                         "is meant for nearly incompressible ones; \"fbar\": false in the material "
+                         "excepts it",
+                         material->name, material->parameters[p]);
+    }
+    if (now->dt_limit > 0 && now->dt > now->dt_limit)
+        run_warn(now, "dt = %g s is above the stability limit %g s", now->dt, now->dt_limit);
+    else if (now->dt_limit > 0 && now->dt > RATIO_DT_CLOSE * now->dt_limit)
+        run_warn(now, "dt = %g s is above %g of the stability limit %g s", now->dt, RATIO_DT_CLOSE,
+                 now->dt_limit);
+}
+
 void run_describe(struct run *r) {
     char *scene = r->scene_json != NULL ? json_print(r->scene_json, false) : NULL;
     cJSON *json = r->scene_json != NULL ? scene_config_json(r->scene_json) : NULL;
@@ -59,29 +81,8 @@ void run_describe(struct run *r) {
     pthread_mutex_unlock(&r->lock);
     free(old_scene);
     free(old_config);
-    if (r->scene == NULL)
-        return;
-    const struct mpm_def *def = scene_def(r->scene);
-    for (size_t k = 0; r->now.fbar && k < def->n_materials; k++) {
-        const struct mpm_material_def *material = &def->materials[k];
-        const struct mpm_parameter *parameter;
-        for (size_t p = 0; p < MPM_MAX_PARAMETERS &&
-                           (parameter = mpm_material_parameter(material->model, p)) != NULL;
-             p++)
-            if (material->fbar && strcmp(parameter->key, "poisson_ratio") == 0 &&
-                material->parameters[p] < RATIO_COMPRESSIBLE)
-                run_warn(&r->now,
-                         "F-bar is on for the compressible material %.60s (poisson_ratio %g): it "
-                         "is meant for nearly incompressible ones; \"fbar\": false in the material "
-                         "excepts it",
-                         material->name, material->parameters[p]);
-    }
-    if (r->now.dt_limit > 0 && r->now.dt > r->now.dt_limit)
-        run_warn(&r->now, "dt = %g s is above the stability limit %g s", r->now.dt,
-                 r->now.dt_limit);
-    else if (r->now.dt_limit > 0 && r->now.dt > RATIO_DT_CLOSE * r->now.dt_limit)
-        run_warn(&r->now, "dt = %g s is above %g of the stability limit %g s", r->now.dt,
-                 RATIO_DT_CLOSE, r->now.dt_limit);
+    if (r->scene != NULL)
+        run_warn_scene(&r->now, scene_def(r->scene));
 }
 
 // Rate of simulated time over the last seconds of running; earlier ones say less about what is to
@@ -155,6 +156,18 @@ void run_status_publish(struct run *r, bool exact) {
     r->last_published = run_clock();
 }
 
+// What the run object tells of a change that is in the log.
+static void remember_change(struct run *r, const cJSON *event) {
+    const char *kind = cJSON_GetStringValue(json_member(event, "event"));
+    if (kind == NULL || strcmp(kind, "config") != 0)
+        return;
+    cJSON *change = history_change_json(r->now.step, r->now.time, // as in the event
+                                        cJSON_Duplicate(json_member(event, "patch"), true));
+    pthread_mutex_lock(&r->lock);
+    cJSON_AddItemToArray(r->changes, change);
+    pthread_mutex_unlock(&r->lock);
+}
+
 // Appends to the event log and publishes.
 enum journal_result run_event_log(struct run *r, cJSON *event, char *why) {
     char *text = json_print(event, false);
@@ -162,10 +175,12 @@ enum journal_result run_event_log(struct run *r, cJSON *event, char *why) {
     snprintf(why, JOURNAL_WHY, "out of memory");
     if (text != NULL)
         result = journal_append_event(r->journal, text, why);
-    if (result == JOURNAL_OK)
+    if (result == JOURNAL_OK) {
         publish_event(r->outlet, text);
-    else
+        remember_change(r, event);
+    } else {
         log_error("event_log", "run=%s why=\"%s\"", r->id, why);
+    }
     free(text);
     cJSON_Delete(event);
     return result;
@@ -192,6 +207,7 @@ void run_state_enter(struct run *r, enum run_state state) {
         cJSON_AddItemToObject(event, "until_time", json_number(r->stop_time));
     if (r->now.error.present)
         cJSON_AddItemToObject(event, "error", history_error(&r->now.error));
+    run_unwarn(&r->now, "the event log cannot be written");
     if (run_event_log(r, event, why) != JOURNAL_OK)
         run_warn(&r->now, "the event log cannot be written: %.150s", why);
     run_status_publish(r, true);

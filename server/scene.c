@@ -2,6 +2,7 @@
 #include "server/scene.h"
 
 #include <math.h>
+#include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 #include <unistd.h>
@@ -572,8 +573,70 @@ static void report(void *context, const struct mpm_error *error) {
                "%s", error->message);
 }
 
+// The object that holds the member a pointer names, and the member's name in `key`; NULL when there
+// is none.
+static cJSON *holder_of(cJSON *root, const char *pointer, char *key, size_t n) {
+    cJSON *at = root, *holder = NULL;
+    while (*pointer == '/') {
+        size_t length = 0;
+        for (pointer++; *pointer && *pointer != '/' && length < n - 1; pointer++)
+            key[length++] =
+                *pointer == '~' && pointer[1] ? (*++pointer == '1' ? '/' : '~') : *pointer;
+        key[length] = 0;
+        holder = at;
+        at = cJSON_IsArray(holder) ? cJSON_GetArrayItem(holder, atoi(key))
+                                   : json_member(holder, key);
+    }
+    return at && cJSON_IsObject(holder) ? holder : NULL;
+}
+
+// Takes out what is at fault where nothing that mpm_check looks at hangs on it: unknown keys, and
+// sections about output and forces. Whether what is left is worth another look.
+static bool prune(cJSON *json, const struct faults *faults, size_t from) {
+    static const char *const apart[] = {"title", "references",   "probes",  "output",
+                                        "loads", "rigid_bodies", "gravity", "damping",
+                                        "fbar",  "transfer"};
+    for (size_t i = from; i < faults->count; i++) {
+        const struct fault *fault = &faults->items[i];
+        char key[256] = "";
+        cJSON *holder = NULL;
+        if (strcmp(fault->code, "unknown_key") == 0) {
+            holder = holder_of(json, fault->pointer, key, sizeof key);
+        } else {
+            size_t length = strcspn(fault->pointer + !!*fault->pointer, "/");
+            for (size_t k = 0; k < sizeof apart / sizeof *apart && !holder; k++)
+                if (length == strlen(apart[k]) &&
+                    strncmp(fault->pointer + 1, apart[k], length) == 0) {
+                    holder = json;
+                    snprintf(key, sizeof key, "%s", apart[k]);
+                }
+            if (!holder)
+                return false;
+        }
+        cJSON_DeleteItemFromObjectCaseSensitive(holder, key);
+        if (holder == json && strcmp(key, "probes") == 0) // they name probes
+            cJSON_DeleteItemFromObjectCaseSensitive(json, "references");
+    }
+    return faults->more == 0;
+}
+
+// The solver's faults of a scene that has others: as far as it can be built without what is at
+// fault.
+static void check_rest(const cJSON *json, struct faults *faults, size_t from) {
+    struct faults left = {0};
+    struct scene *scene = calloc(1, sizeof *scene);
+    if (scene && (scene->json = cJSON_Duplicate(json, true)) && cJSON_IsObject(scene->json) &&
+        prune(scene->json, faults, from)) {
+        scene_check(scene->json, &left);
+        if (left.count + left.more == 0 && read_definition(scene))
+            mpm_check(&scene->def, report, faults);
+    }
+    faults_free(&left);
+    scene_free(scene);
+}
+
 struct scene *scene_create(const cJSON *json, struct faults *faults) {
-    size_t before = faults->count + faults->more;
+    size_t before = faults->count + faults->more, first = faults->count;
     struct scene *scene = calloc(1, sizeof *scene);
     if (!scene || !(scene->json = cJSON_Duplicate(json, true)))
         goto out_of_memory;
@@ -582,6 +645,8 @@ struct scene *scene_create(const cJSON *json, struct faults *faults) {
         if (!read_definition(scene))
             goto out_of_memory;
         mpm_check(&scene->def, report, faults);
+    } else {
+        check_rest(json, faults, first);
     }
     if (faults->count + faults->more == before)
         return scene;
@@ -668,6 +733,28 @@ static void drop_stale_fbar(cJSON *merged, const cJSON *patch) {
             cJSON_Delete(cJSON_DetachItemViaPointer(fbar, stale));
 }
 
+// A patch that brings dt to a run with a cfl, or the other way round: the fault is the patch's.
+static void check_time_rivals(cJSON *merged, const cJSON *patch, struct faults *faults) {
+    static const char *const names[2] = {"dt", "cfl"};
+    cJSON *time = json_member(merged, "time");
+    const cJSON *change = json_member(patch, "time");
+    for (int k = 0; k < 2; k++) {
+        const char *name = names[k], *rival = names[!k];
+        const cJSON *given = json_member(change, name);
+        if (!given || cJSON_IsNull(given) || json_member(change, rival) ||
+            !json_member(time, rival))
+            continue;
+        char pointer[16], expected[32];
+        snprintf(pointer, sizeof pointer, "/time/%s", name);
+        snprintf(expected, sizeof expected, "together with \"%s\": null", rival);
+        char *actual = json_print(given, false);
+        faults_add(faults, pointer, "conflict", expected, actual,
+                   "`dt` and `cfl` exclude each other; set `%s` to null in the same patch", rival);
+        free(actual);
+        cJSON_DeleteItemFromObjectCaseSensitive(time, rival); // said already
+    }
+}
+
 // A frame can gain a field only where the run has kept it from the start.
 static void check_new_fields(const cJSON *before, const cJSON *after, struct faults *faults) {
     static const enum mpm_field kept[] = {MPM_FIELD_DISPLACEMENT, MPM_FIELD_VOLUME_RATIO};
@@ -686,6 +773,7 @@ cJSON *scene_config_patch(const cJSON *scene_as_run, const cJSON *patch, struct 
     if (cJSON_IsObject(reachable)) {
         merged = json_merge_patch(scene_as_run, reachable);
         drop_stale_fbar(merged, reachable);
+        check_time_rivals(merged, reachable, faults);
         scene_check(merged, faults);
     }
     cJSON_Delete(reachable);

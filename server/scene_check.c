@@ -326,7 +326,7 @@ static void check_keys(struct check *check, const struct scene_key *keys, cJSON 
             misplaced_key(check, key, selector, object, &here);
         } else if (member) {
             if (excluded && rival < key)
-                scene_fault(check->faults, &here, "conflict", "only one of the two", NULL,
+                scene_fault(check->faults, &here, "conflict", "only one of the two", key->name,
                             "`%s` and `%s` exclude each other; leave one out or set it to null",
                             rival->name, key->name);
             check_value(check, &key->value, member, &here);
@@ -555,8 +555,9 @@ static void check_material_patch(struct check *check, cJSON *json, const struct 
             if (!key)
                 unknown_key(check, table.keys, change->string, &member);
             else if (key->value.type != SCENE_NUMBER || strcmp(key->name, "density") == 0)
-                scene_fault(check->faults, &member, "immutable", "absent", NULL,
-                            "`%s` of a material cannot change from stage to stage", key->name);
+                scene_given_fault(check->faults, &member, "immutable", "absent", change,
+                                  "`%s` of a material cannot change from stage to stage",
+                                  key->name);
             else if (!cJSON_IsNull(change))
                 check_value(check, &key->value, change, &member);
             else if (key->required)
@@ -799,6 +800,34 @@ static void check_references(struct check *check, const cJSON *references,
     }
 }
 
+// Whether a material of the scene has a plastic strain; also where its model cannot be told.
+static bool any_yields(const cJSON *materials) {
+    for (const cJSON *material = materials->child; material; material = material->next) {
+        const cJSON *name = json_member(material, "model");
+        const struct mpm_material *model =
+            cJSON_IsString(name) ? mpm_material_find(name->valuestring) : NULL;
+        if (!model || mpm_material_yields(model))
+            return true;
+    }
+    return false;
+}
+
+static void check_output_fields(struct check *check, const cJSON *fields, const cJSON *materials,
+                                const struct scene_cursor *root) {
+    if (any_yields(materials))
+        return;
+    struct scene_cursor output = {.parent = root, .key = "output"};
+    struct scene_cursor list = {.parent = &output, .key = "fields"};
+    const char *name = mpm_field_info(MPM_FIELD_PLASTIC_STRAIN)->name;
+    size_t i = 0;
+    for (const cJSON *field = fields->child; field; field = field->next, i++) {
+        struct scene_cursor at = {.parent = &list, .index = i};
+        if (cJSON_IsString(field) && strcmp(field->valuestring, name) == 0)
+            scene_given_fault(check->faults, &at, "unsupported", "a field that the scene has",
+                              field, "no material of the scene has a `%s`", name);
+    }
+}
+
 // Frames begin with the position.
 static void put_position_first(cJSON *scene) {
     cJSON *fields = json_member(json_member(scene, "output"), "fields"), *position = NULL;
@@ -842,6 +871,10 @@ void scene_check(cJSON *scene, struct faults *faults) {
     const cJSON *references = json_member(scene, "references");
     if (cJSON_IsArray(references) && cJSON_GetArraySize(references) <= SCENE_MAX_NAMED)
         check_references(&check, references, &root);
+    const cJSON *fields = json_member(json_member(scene, "output"), "fields");
+    const cJSON *materials = json_member(scene, "materials");
+    if (cJSON_IsArray(fields) && cJSON_IsObject(materials))
+        check_output_fields(&check, fields, materials, &root);
     put_position_first(scene);
 }
 
@@ -871,8 +904,8 @@ static void check_live_keys(struct check *check, const struct scene_key *keys, c
         if (!key)
             unknown_key(check, keys, change->string, &here);
         else
-            scene_fault(check->faults, &here, "immutable", "absent", NULL,
-                        "`%s` cannot change while the run goes on", key->name);
+            scene_given_fault(check->faults, &here, "immutable", "absent", change,
+                              "`%s` cannot change while the run goes on", key->name);
         cJSON_Delete(cJSON_DetachItemViaPointer(patch, change));
     }
 }

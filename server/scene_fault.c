@@ -19,18 +19,24 @@ static void pointer_text(const struct scene_cursor *at, char *out, size_t n) {
     json_pointer_append(out, n, at->key ? at->key : index);
 }
 
-void scene_fault(struct faults *faults, const struct scene_cursor *at, const char *code,
-                 const char *expected, const char *actual, const char *format, ...) {
+static void fault_with(struct faults *faults, const struct scene_cursor *at, const char *code,
+                       const char *expected, const char *actual, const char *format,
+                       va_list arguments) {
     char pointer[1024] = "", detail[1024], *whole = NULL;
     pointer_text(at, pointer, sizeof pointer);
-    va_list arguments;
-    va_start(arguments, format);
     if (vasprintf(&whole, format, arguments) < 0)
         whole = NULL;
-    va_end(arguments);
     scene_clip(detail, sizeof detail, whole ? whole : ""); // what came may be of any length
     free(whole);
     faults_add(faults, pointer, code, expected, actual, "%s", detail);
+}
+
+void scene_fault(struct faults *faults, const struct scene_cursor *at, const char *code,
+                 const char *expected, const char *actual, const char *format, ...) {
+    va_list arguments;
+    va_start(arguments, format);
+    fault_with(faults, at, code, expected, actual, format, arguments);
+    va_end(arguments);
 }
 
 void scene_clip(char *out, size_t size, const char *text) {
@@ -63,6 +69,16 @@ void scene_value_fault(struct faults *faults, const struct scene_cursor *at, con
     char actual[80];
     actual_text(json, actual);
     scene_fault(faults, at, code, expected, actual, "must be %s, got %s", expected, actual);
+}
+
+void scene_given_fault(struct faults *faults, const struct scene_cursor *at, const char *code,
+                       const char *expected, const cJSON *json, const char *format, ...) {
+    char actual[80];
+    va_list arguments;
+    actual_text(json, actual);
+    va_start(arguments, format);
+    fault_with(faults, at, code, expected, actual, format, arguments);
+    va_end(arguments);
 }
 
 // ---- Did you mean -------------------------------------------------------------------------------

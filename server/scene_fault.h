@@ -18,6 +18,11 @@ void scene_fault(struct faults *faults, const struct scene_cursor *at, const cha
 void scene_value_fault(struct faults *faults, const struct scene_cursor *at, const char *code,
                        const char *expected, const cJSON *json);
 
+// As scene_fault, with the value in a few words as what came.
+void scene_given_fault(struct faults *faults, const struct scene_cursor *at, const char *code,
+                       const char *expected, const cJSON *json, const char *format, ...)
+    __attribute__((format(printf, 6, 7)));
+
 // The candidate nearest to a word that is unknown, if one is near. Start with `word` alone.
 struct scene_suggestion {
     const char *word, *best;

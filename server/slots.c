@@ -114,19 +114,3 @@ void slots_unreserve(struct slots *s, struct slot *slot) {
     pthread_mutex_unlock(&s->lock);
     grant_all(s, slot);
 }
-
-size_t slots_queued(struct slots *s) {
-    size_t n = 0;
-    pthread_mutex_lock(&s->lock);
-    for (const struct slot *slot = s->queue; slot != NULL; slot = slot->next)
-        n++;
-    pthread_mutex_unlock(&s->lock);
-    return n;
-}
-
-size_t slots_memory_used(struct slots *s) {
-    pthread_mutex_lock(&s->lock);
-    size_t used = s->used;
-    pthread_mutex_unlock(&s->lock);
-    return used;
-}

@@ -30,5 +30,3 @@ void slots_leave(struct slots *slots,
 // Memory without a slot: false when it does not fit now.
 bool slots_reserve(struct slots *slots, struct slot *slot, size_t bytes);
 void slots_unreserve(struct slots *slots, struct slot *slot); // all that it reserved
-size_t slots_queued(struct slots *slots);
-size_t slots_memory_used(struct slots *slots);

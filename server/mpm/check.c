@@ -9,6 +9,7 @@
 #define MAX_PER_DIRECTION 32 // particles per cell and direction: beyond it a smaller cell is meant
 #define MAX_PARTICLES 2000000000.0 // ids are 32 bits
 #define MAX_NODES 4000000000.0
+#define MAX_STEPS 1e15            // beyond it doubles soon no longer count one by one
 #define NODE_PLANE_TOLERANCE 1e-6 // cells: round-off of a wall's place, far below any offset meant
 
 struct report {
@@ -411,13 +412,14 @@ static bool boxes_meet(const struct mpm_shape *a, const struct mpm_shape *b, int
     return meet;
 }
 
-// Particles of the body that it would have at most; adds to `total`, the sum over the bodies.
-static void check_body(struct report *r, const struct mpm_def *def, size_t b, double *total) {
+// Particles of the body that it would have at most; adds to `total`, the sum over the bodies. False
+// without a material: then there is no wave speed.
+static bool check_body(struct report *r, const struct mpm_def *def, size_t b, double *total) {
     const struct mpm_body_def *body = &def->bodies[b];
     if (body->material < 0 || (size_t)body->material >= def->n_materials) {
         FAULT(r, MPM_ERR_REFERENCE, TEXT("/bodies/%s/material", body->name), "a material", "",
               "body '%s' has no material", body->name);
-        return;
+        return false;
     }
     if (body->particles_per_direction < 1 || body->particles_per_direction > MAX_PER_DIRECTION) {
         FAULT(r, MPM_ERR_RANGE, TEXT("/bodies/%s/particles_per_cell", body->name),
@@ -425,7 +427,7 @@ static void check_body(struct report *r, const struct mpm_def *def, size_t b, do
               TEXT("n = %d", body->particles_per_direction),
               "particles_per_cell must be a power of whole numbers from 1 to %d per direction",
               MAX_PER_DIRECTION);
-        return;
+        return true;
     }
     const double bound = mpm_seed_bound(def, body);
     *total += bound;
@@ -443,7 +445,7 @@ static void check_body(struct report *r, const struct mpm_def *def, size_t b, do
             "particles per cell",
             body->name, bound);
         *total = INFINITY; // nothing of this size is counted one by one
-        return;
+        return true;
     }
     struct outside o = {.def = def, .unit = def->cell / 2 / body->particles_per_direction};
     // One by one only where something can be wrong with a particle.
@@ -488,6 +490,7 @@ static void check_body(struct report *r, const struct mpm_def *def, size_t b, do
                   def->bodies[a].name, body->name, o.in_other);
         }
     }
+    return true;
 }
 
 // ---- Walls, loads, rigid bodies, probes, stages -------------------------------------------------
@@ -736,7 +739,7 @@ static void check_stages(struct report *r, const struct mpm_def *def) {
     }
 }
 
-// Needs everything else to be in order: the wave speeds and shapes.
+// Needs the wave speeds and shapes.
 static void check_times(struct report *r, const struct mpm_def *def) {
     struct mpm_error fault;
     for (size_t k = 0; k < def->n_stages; k++) {
@@ -799,8 +802,12 @@ size_t mpm_check(const struct mpm_def *def,
         return r.count; // what follows would divide by them
     }
     double total = 0;
+    bool made_of = true;
     for (size_t b = 0; b < def->n_bodies && total < INFINITY; b++) {
-        check_body(&r, def, b, &total);
+        made_of &= check_body(&r, def, b, &total);
+    }
+    if (made_of) {
+        check_times(&r, def);
     }
     for (size_t k = 0; k < def->n_loads && r.count == 0; k++) {
         check_load_particles(&r, def, &def->loads[k]);
@@ -811,9 +818,13 @@ size_t mpm_check(const struct mpm_def *def,
     if (r.count) {
         return r.count;
     }
-    check_times(&r, def);
     struct mpm_estimate estimate;
     mpm_estimate(def, &estimate);
+    if ((double)estimate.steps > MAX_STEPS) {
+        FAULT(&r, MPM_ERR_RANGE, "/time/end", TEXT("at most %.0e steps", MAX_STEPS),
+              TEXT("%.9g s", def->stages[def->n_stages - 1].duration),
+              "the run would take more than %.0e steps of %.6g s", MAX_STEPS, estimate.dt);
+    }
     if (def->memory_limit && estimate.bytes > def->memory_limit) {
         FAULT(
             &r, MPM_ERR_MEMORY, "", TEXT("at most %zu bytes", def->memory_limit),

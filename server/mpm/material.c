@@ -37,6 +37,10 @@ const char *mpm_material_doc(const struct mpm_material *model) {
     return model->doc;
 }
 
+bool mpm_material_yields(const struct mpm_material *model) {
+    return model->plastic;
+}
+
 const struct mpm_parameter *mpm_material_parameter(const struct mpm_material *model, size_t k) {
     for (size_t i = 0; i < k; i++) {
         if (!model->parameters[i].key) {

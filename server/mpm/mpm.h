@@ -25,8 +25,9 @@
 #define MPM_PROBE_LIST(X)                                                                          \
     X(EXTENT, "extent")                                                                            \
     X(DISPLACEMENT, "displacement")                                                                \
-    X(FIELD, "field") X(REACTION, "reaction") X(MAXIMUM, "maximum") X(MINIMUM, "minimum")          \
-        X(MEAN, "mean") X(ENERGY, "energy") X(MOMENTUM, "momentum") X(DRIFT, "drift")
+    X(FIELD, "field")                                                                              \
+    X(REACTION, "reaction") X(MAXIMUM, "maximum") X(MINIMUM, "minimum") X(MEAN, "mean")            \
+        X(ENERGY, "energy") X(MOMENTUM, "momentum") X(DRIFT, "drift")
 
 enum mpm_basis {
 #define X(code, text) MPM_##code,
@@ -80,6 +81,7 @@ const struct mpm_material *mpm_material_at(size_t index);        // in the order
 const struct mpm_material *mpm_material_find(const char *model); // NULL when there is none
 const char *mpm_material_name(const struct mpm_material *model);
 const char *mpm_material_doc(const struct mpm_material *model); // one sentence
+bool mpm_material_yields(const struct mpm_material *model);     // has an equivalent plastic strain
 // Parameter k (k < MPM_MAX_PARAMETERS), NULL past the last; its position is that in
 // mpm_material_def.
 const struct mpm_parameter *mpm_material_parameter(const struct mpm_material *model, size_t k);
@@ -184,10 +186,10 @@ struct mpm_stage_def {
     double kinetic_energy_ratio;
     unsigned states; // enum mpm_setting
     struct mpm_settings settings;
-    double gravity_ramp;      // s, linear from the gravity before the stage (0 before the first)
-    unsigned resets;          // enum mpm_reset, done as the stage begins
-    const bool *removes_wall; // (n_walls), or NULL
-    const bool *removes_load; // (n_loads), or NULL
+    double gravity_ramp;       // s, linear from the gravity before the stage (0 before the first)
+    unsigned resets;           // enum mpm_reset, done as the stage begins
+    const bool *removes_wall;  // (n_walls), or NULL
+    const bool *removes_load;  // (n_loads), or NULL
     const bool *removes_rigid; // (n_rigids), or NULL
     const struct mpm_material_def *materials; // (n_materials) from this stage on, or NULL
 };
@@ -197,7 +199,7 @@ struct mpm_stage_def {
 // p(d) = stiffness [2 (d - D) ln(d/D) + (d - D)^2/d] / D, over the particle's area.
 struct mpm_rigid_def {
     const char *name;
-    struct mpm_shape shape; // a box, ball or polygon
+    struct mpm_shape shape;       // a box, ball or polygon
     double velocity[MPM_MAX_DIM]; // m/s
     double stiffness;             // Pa
     double distance;              // m
@@ -223,8 +225,8 @@ struct mpm_load_def {
 struct mpm_probe_def {
     const char *name;
     enum mpm_probe_kind kind;
-    int body;  // index, -1 = all
-    int wall;  // of a reaction, or -1: of `rigid`
+    int body; // index, -1 = all
+    int wall; // of a reaction, or -1: of `rigid`
     int rigid;
     int field; // enum mpm_field
     int axis;
@@ -359,7 +361,7 @@ struct mpm_balance {
     double angular_momentum[MPM_MAX_DIM]; // kg m^2/s about the origin; in 2D only [2]
     double kinetic_energy, strain_energy; // J, strain energy of the deformation that stress uses
     double potential_energy;              // J, -m g x with the gravity in force
-    double external_work;                 // J, by gravity, loads, walls and rigid bodies since step 0
+    double external_work; // J, by gravity, loads, walls and rigid bodies since step 0
 };
 // Summed in a fixed order: the same bits for any number of threads.
 void mpm_balance(const struct mpm_sim *sim, struct mpm_balance *out);

@@ -530,7 +530,7 @@ void mpm_estimate(const struct mpm_def *def, struct mpm_estimate *out) {
         out->dt = now.dt > 0 ? now.dt : now.cfl / STABLE_CFL * out->dt_limit;
         steps += ceil(def->stages[k].duration / out->dt * (1 - 1e-9));
     }
-    out->steps = (uint64_t)steps;
+    out->steps = (uint64_t)fmin(steps, 9e18); // what is beyond has no whole number
 }
 
 // ---- Queries and changes

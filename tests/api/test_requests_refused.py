@@ -525,3 +525,30 @@ def test_two_runs_of_one_id_at_the_same_moment_are_one_201_and_the_rest_409(daem
     assert sorted(replies) == [201] + [409] * 7
     daemon.away(name)
     until(lambda: name not in [r["id"] for r in daemon.get("/v1/runs")["runs"]])
+
+
+@pytest.mark.parametrize(
+    "more, pointer, actual",
+    [
+        ({"id": "a/b"}, "/id", '"a/b"'), ({"id": ""}, "/id", '""'), ({"id": "x" * 65}, "/id", "x" * 65),
+        ({"wait_subscribers": 3}, "/wait_subscribers", "3"), ({"wait_subscribers": 1.5}, "/wait_subscribers", "1.5"),
+        ({"overrides": {"loads": {"a": 1}}}, "/scene/loads", "object"), ({"idd": "a"}, "/idd", "idd"),
+    ],
+)  # fmt: skip
+def test_actual_is_told_where_it_is_at_hand(daemon, more, pointer, actual):
+    fault = daemon.ask("POST", "/v1/runs", {"scene": water(), **more}, status=422).fault(pointer)
+    assert actual in fault["actual"]
+    assert fault["expected"] == fault["expected"].strip()
+    if pointer == "/idd":
+        assert 'did you mean "id"?' in fault["detail"]
+
+
+def test_actual_of_a_step_is_told(daemon, name):
+    daemon.create(endless(), id=name, start=False)
+    for body in ({"steps": -1}, {"steps": 1.5}, {"steps": "a"}, {"until": "a"}):
+        (key, value), = body.items()
+        fault = daemon.ask("POST", f"/v1/runs/{name}:step", body, status=422).fault(f"/{key}")
+        assert fault["actual"] == (f'"{value}"' if value == "a" else str(value))
+    fault = daemon.ask("POST", f"/v1/runs/{name}:step", {"until": -5}, status=422).fault("/until")
+    assert "-0" not in fault["detail"]
+    daemon.away(name)

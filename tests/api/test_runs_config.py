@@ -1,7 +1,7 @@
 """What may change while a run goes on."""
 import pytest
 from boxes import endless, water
-from fbard import fbar_is_on, until
+from fbard import Daemon, fbar_is_on, until
 from frames import Frame
 
 
@@ -237,3 +237,51 @@ def test_patch_of_a_finished_run_is_409(daemon, name):
 def test_config_of_an_unknown_run_is_404(daemon):
     daemon.ask("GET", "/v1/runs/nobody/config", status=404)
     daemon.ask("PATCH", "/v1/runs/nobody/config", {"fbar": True}, status=404)
+
+
+def test_run_tells_its_changes_also_after_a_restart(tmp_path):
+    d = Daemon(tmp_path).start()
+    patches = [{"fbar": True}, {"damping": {"mass": 1}}, {"fbar": False}]
+    try:
+        d.create(endless(), id="r", start=False)
+        assert d.run("r")["changes"] == []
+        told = []
+        for patch in patches:
+            d.act("r", "step", {"steps": 10})
+            d.wait("r", "paused")
+            told.append({"step": d.patch("r", patch)["effective_step"], "patch": patch})
+        d.patch("r", {"fbar": False})  # changes nothing
+        changes = d.run("r")["changes"]
+        assert [{"step": c["step"], "patch": c["patch"]} for c in changes] == told
+        assert [c["time"] for c in changes] == pytest.approx([0.01, 0.02, 0.03])
+        d.kill()
+        d.start()
+        assert d.run("r")["changes"] == changes
+        d.act("r", "cancel")
+        d.stop()
+        d.start()
+        assert d.run("r")["changes"] == changes
+    finally:
+        d.stop()
+
+
+def test_dt_on_a_cfl_run_is_a_fault_of_the_patch(daemon, name):
+    scene = endless(time={"dt": None, "cfl": 0.2})
+    daemon.create(scene, id=name, start=False)
+    reply = daemon.ask("PATCH", f"/v1/runs/{name}/config", {"time": {"dt": 1e-4}}, status=422)
+    assert reply.pointers == ["/time/dt"]
+    assert reply.fault("/time/dt")["actual"] == "0.0001" and "null" in reply.fault("/time/dt")["expected"]
+    daemon.away(name)
+
+
+def test_actual_names_what_cannot_change(daemon, live):
+    reply = daemon.ask("PATCH", f"/v1/runs/{live}/config", {"cell": 0.5, "basis": "gimp"}, status=422)
+    assert reply.fault("/cell")["actual"] == "0.5" and "gimp" in reply.fault("/basis")["actual"]
+
+
+def test_a_finished_run_says_that_its_configuration_stays(daemon, name):
+    daemon.create(water(time={"end": 0.005}), id=name)
+    daemon.wait(name, "completed")
+    reply = daemon.ask("PATCH", f"/v1/runs/{name}/config", {"fbar": False}, status=409)
+    assert "its configuration cannot change" in reply.json["detail"]
+    daemon.away(name)

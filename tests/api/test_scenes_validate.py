@@ -156,3 +156,25 @@ def test_a_scene_beyond_the_memory_limit_is_422_before_anything_is_allocated(tmp
         assert d.get("/v1/runs")["runs"] == []
     finally:
         d.stop()
+
+
+def test_faults_of_keys_and_of_the_solver_come_at_once(daemon):
+    overrides = {"foo": 1, "time": {"dt": 1e-2},
+                 "bodies": {"reservoir": {"shape": {"box": {"min": [-1, 0], "max": [4, 2]}}}}}  # fmt: skip
+    reply = validate(daemon, {"scene": "dam-break", "overrides": overrides}, 422)
+    assert {"/scene/foo", "/scene/time/dt", "/scene/bodies/reservoir/shape"} <= set(reply.pointers)
+
+
+def test_validate_warns_as_the_run_does(daemon, name):
+    scene = endless(fbar=True)
+    warnings = validate(daemon, scene).json["warnings"]
+    assert warnings and "compressible" in warnings[0]
+    assert daemon.create(scene, id=name, start=False)["warnings"] == warnings
+    assert validate(daemon, water()).json["warnings"] == []
+    daemon.away(name)
+
+
+def test_a_field_or_an_end_that_no_run_can_give_is_a_fault(daemon):
+    reply = validate(daemon, water(output={"fields": ["plastic_strain"]}), 422)
+    assert reply.fault("/output/fields/0")["actual"] == '"plastic_strain"'
+    assert "steps" in validate(daemon, water(time={"end": 1e300}), 422).fault("/time/end")["detail"]

@@ -9,6 +9,7 @@ import socket
 import ssl
 import stat
 import subprocess
+import time
 
 import pytest
 from boxes import endless, merged, water
@@ -418,3 +419,27 @@ def test_torn_tails_are_cut(fresh, reference):
     d.start()
     until(lambda: d.run("survivor")["state"] in ("running", "queued", "completed", "failed"))
     check_same(d, reference)
+
+
+def test_a_full_disk_is_warned_of_while_it_is_full(tmp_path):
+    """A run waits for room, or fails; the log tells of it once, and the warning goes with its cause."""
+    if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", tmp_path], capture_output=True).returncode:
+        pytest.skip("cannot mount a small tmpfs here")
+    try:
+        d = Daemon(tmp_path).start()
+        try:
+            scene = water(output={"interval": 1e-3}, bodies={"pool": {"particles_per_cell": 100}})
+            d.create(scene, id="waits")
+            d.create(merged(scene, {"output": {"when_full": "fail"}}), id="fails")
+            error = d.wait("fails", "failed")["error"]
+            assert error["kind"] == "journal" and error["quantity"] is None
+            d.wait("waits", "waiting")
+            time.sleep(1.2)  # it is tried again twice
+            assert "room on the disk" in d.run("waits")["warnings"][0]
+            assert sum("event=journal topic=run/waits" in line for line in d.stderr().splitlines()) == 1
+            subprocess.run(["mount", "-o", "remount,size=100m", tmp_path], check=True)
+            assert d.wait("waits", "completed")["warnings"] == []
+        finally:
+            d.stop()
+    finally:
+        subprocess.run(["umount", "-l", tmp_path])

@@ -94,7 +94,9 @@ class Fake:
             f"{100 * i},{0.01 * i!r},{4 + 0.01 * i!r},{7 * i},{i},{'' if i == 1 else -i}\r\n"
             for i in range(n_frames))
         self.changes = [{"step": 500, "time": 0.05, "patch": {"fbar": False}}]
-        self.scene = {"title": "Fake", "dimension": 2, "gravity": [0, -9.81]}
+        self.scene = {"title": "Fake", "dimension": 2, "gravity": [0, -9.81], "probes": {
+            "front": {"kind": "extent", "axis": "x", "side": "max", "body": "water"},
+            "force": {"kind": "reaction", "wall": "floor"}}}
         self.problem = None
         self.http_port = self.publish_port = 0
         self.up()

@@ -27,11 +27,20 @@ def test_help_names_every_command(fbar):
     assert "usage: fbar record" in fbar("help", "record").stdout
 
 
+def test_version(fbar):
+    for words in (["--version"], ["version"], ["list", "--version"], ["step", "--version"]):
+        result = fbar(*words)
+        assert result.returncode == 0 and result.stdout.split()[0] == "fbar"
+        assert result.stdout == fbar("--version").stdout and not result.stderr
+
+
 @pytest.mark.parametrize("words", [
     [], ["nonsense"], ["list", "extra"], ["show"], ["show", "a", "b"], ["list", "--nonsense"], ["-x", "list"],
     ["record", "r1"], ["record", "-o", "a.h5"], ["record", "r1", "-o"], ["run"], ["set", "r1"],
     ["set", "r1", "novalue"], ["set", "r1", "a..b=1"], ["step", "r1", "--steps", "0"],
-    ["step", "r1", "-n", "x"], ["plot", "a.h5"], ["plot", "a.h5", "-o", "a.png", "--size", "1x1"],
+    ["step", "r1", "-n", "x"], ["step", "r1", "x"],
+    ["step", "r1", "1.5"], ["step", "r1", "2", "-n", "2"], ["step", "r1", "-n", "2", "-u", "1"],
+    ["plot", "a.h5"], ["plot", "a.h5", "-o", "a.png", "--size", "1x1"],
     ["plot", "a.h5", "-o", "a.png", "--series", "d"], ["--url", "ftp://x", "list"],
     ["record", "r1", "-o", "a.h5", "--compress", "11"], ["run", "x", "--json=1"], ["help", "nonsense"]])
 def test_usage_errors_exit_2(fbar, words):
@@ -111,13 +120,14 @@ def test_step_set_and_delete_send_their_bodies(fbar, fake):
     daemon = fake()
     assert fbar("step", "r1", url=daemon.url).returncode == 0
     assert fbar("step", "r1", "--steps", "20", url=daemon.url).returncode == 0
+    assert fbar("step", "r1", "30", url=daemon.url).returncode == 0
     assert fbar("step", "r1", "--until", "0.25", url=daemon.url).returncode == 0
     assert fbar("set", "r1", "fbar=false", "damping.local=0.1", "damping.mass=2", "time.cfl=null",
                 'fbar={"scheme":"anchored"}', "title=plain text", "gravity=[0,-1]",
                 url=daemon.url).returncode == 0
     assert fbar("delete", "r1", url=daemon.url).returncode == 0
     assert [body for _, _, body in daemon.bodies] == [
-        {"steps": 1}, {"steps": 20}, {"until": 0.25},
+        {"steps": 1}, {"steps": 20}, {"steps": 30}, {"until": 0.25},
         {"fbar": {"scheme": "anchored"}, "damping": {"local": 0.1, "mass": 2}, "time": {"cfl": None},
          "title": "plain text", "gravity": [0, -1]}]
     assert ("DELETE", "/v1/runs/r1") in daemon.requests
@@ -202,6 +212,16 @@ def test_watch_on_a_terminal_redraws_one_line(fake):
     assert result.stdout.count(b"\r\033[K") >= 2 and "█" in result.stdout.decode()
 
 
+def test_no_progress_line_is_printed_twice(fbar, fake):
+    daemon = fake(n_frames=4)
+    daemon.advance(4, live=False)
+    for state in ("failed", "completed"):
+        daemon.state = state
+        for words in (["run", "fake", "-o", f"{state}.h5"], ["run", "fake"], ["watch", "r1"]):
+            lines = [x for x in fbar(*words, url=daemon.url).stderr.splitlines() if "step" in x]
+            assert len(lines) == len(set(lines)) == 1, (words, lines)
+
+
 def test_run_records_and_reports(fbar, fake, tmp_path):
     daemon = fake()
     daemon.play(0.005)
@@ -271,6 +291,21 @@ def test_plot_draws_a_picture(fbar, recording, tmp_path, words, size):
         assert answer["time"] == 0.02 and answer["field"] == "velocity"
     if "--range" in words:
         assert (answer["low"], answer["high"]) == (-5, 5)
+
+
+@pytest.mark.parametrize("time, warned", [
+    ("99", "0.05"), ("-1", "0"), ("0.056", "0.05"), ("0.054", None), ("0.025", None), (None, None),
+    ("0.01,0.2", "0.05")])
+def test_plot_warns_of_a_time_that_was_not_recorded(fbar, recording, time, warned):
+    result = fbar("plot", "a.h5", "-o", "a.png", "--size", "640x400", *(["--time", time] if time else []))
+    assert result.returncode == 0
+    lines = result.stderr.splitlines()
+    if warned is None:
+        assert not lines
+    else:
+        asked = time.split(",")[-1]
+        assert lines == [f"fbar: warning: a.h5 has no frame near t = {asked} s; drawing the nearest, "
+                         f"t = {warned} s"]
 
 
 def test_plot_3d_and_series(fbar, fake, tmp_path):

@@ -92,9 +92,51 @@ def test_run_records_what_the_daemon_published(daemon, fbar, tmp_path):
         np.testing.assert_array_equal(front["time"][:], table[:, 1])
         np.testing.assert_array_equal(front["value"][:], table[:, names.index("front")])
         assert f["VTKHDF/Points"].shape[0] == 512 * len(frames)
+        units = {name: probe["value"].attrs["unit"] for name, probe in f["fbard/probes"].items()}
+        assert units == {"front": b"m", "crest": b"m", "energy": b"J/m", "momentum": b"kg/s",
+                         "drift": b"1", "pressure_max": b"Pa"}
+        assert len(f["fbard/changes/step"]) == 0
     # A recording of the finished run, over HTTP alone, is the same file.
     assert fbar("record", "whole", "-o", "b.h5", url=daemon).returncode == 0
     assert (tmp_path / "a.h5").read_bytes() == (tmp_path / "b.h5").read_bytes()
+
+
+def send(url, method, body=None):
+    request = urllib.request.Request(url, method=method, data=json.dumps(body or {}).encode(),
+                                     headers={"Content-Type": "application/json"})
+    with urllib.request.urlopen(request, timeout=10) as reply:
+        return json.loads(reply.read())
+
+
+def test_record_keeps_the_changes_of_parameters(daemon, fbar, start_fbar, tmp_path):
+    run = f"{daemon}/v1/runs/changed"
+    runner = start_fbar("run", "dam-break", *SMALL, "--set", "time.end=1e3", "--id", "changed", "-o",
+                        "a.h5", url=daemon)
+    end = time.monotonic() + 20
+    while fbar("show", "changed", url=daemon).returncode or json.loads(get(run))["step"] < 20:
+        assert time.monotonic() < end and runner.poll() is None
+        time.sleep(0.02)
+    wanted = []
+    patches = {"fbar": False}, {"damping": {"local": 0.25}}, {"fbar": {"scheme": "anchored", "a": 0.1}}
+    send(run + ":pause", "POST")
+    for i, patch in enumerate(patches):
+        wanted.append((send(run + "/config", "PATCH", patch)["effective_step"], patch))
+        if i == 0:
+            send(run + ":resume", "POST")  # the others come while it runs
+        time.sleep(0.1)
+    assert fbar("set", "changed", "time.end=1e-9", url=daemon).returncode == 2  # a refused one is none
+    send(run + ":cancel", "POST")
+    assert runner.wait(20) == 1
+    told = [(c["step"], c["patch"]) for c in json.loads(get(run))["changes"]]
+    with h5py.File(tmp_path / "a.h5") as f:
+        changes, frames = f["fbard/changes"], f["fbard/frames"]
+        kept = [(int(step), json.loads(patch)) for step, patch in zip(changes["step"], changes["patch"])]
+        assert kept == told == wanted
+        assert list(changes["time"][:]) == sorted(changes["time"][:]) and changes["time"][0] > -0.06
+        on = frames["step"][:] > wanted[0][0]
+        between = on & (frames["step"][:] <= wanted[2][0])
+        assert frames["fbar"][:][~on].all() and not frames["fbar"][:][between].any()
+    assert ", 3 changes of parameters" in fbar("info", "a.h5").stdout
 
 
 def test_record_killed_beside_a_live_run(daemon, fbar, start_fbar, tmp_path):

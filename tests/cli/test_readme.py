@@ -102,6 +102,19 @@ def test_make_lines():
         assert done.returncode == 0, done.stderr
 
 
+def test_links_lead_somewhere():
+    """Files exist; headings have the place that GitHub gives them. The web is not asked."""
+    places = {re.sub(r"[^\w -]", "", h.lower()).replace(" ", "-") for h in
+              re.findall(r"^#+ (.*)$", re.sub(r"^```.*?^```$", "", README, flags=re.M | re.S), re.M)}
+    links = re.findall(r"\]\(([^)\s]+)\)", README)
+    assert len(links) > 5
+    for link in links:
+        if link.startswith("#"):
+            assert link[1:] in places, link
+        elif "://" not in link:
+            assert (conftest.ROOT / link.split("#")[0]).is_file(), link
+
+
 def test_nothing_is_left_out():
     assert {words[0] for words in commands()} <= {"make", "curl", "build/fbar"}
     for command in re.findall(r"`build/fbar ([a-z]+)`", README):

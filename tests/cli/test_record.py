@@ -61,6 +61,10 @@ def test_record_live_run_holds_every_value(fbar, fake, start_fbar, tmp_path):
         assert about["probes/force"].attrs["components"] == b"x,y"
         assert about["probes/force/value"][2].tolist() == [2, -2]
         assert np.isnan(about["probes/force/value"][1, 1])
+        front = about["probes/front/value"].attrs
+        assert front["unit"] == b"m" and front["long_name"] == b"extent along x, max, body water"
+        assert about["probes/force/value"].attrs["unit"] == b"N/m"
+        assert about['probes/a "b", c/value'].attrs["unit"] == b"unknown"  # the scene has no such probe
         assert about["changes/step"][0] == 500 and about["changes/time"][0] == 0.05
         assert json.loads(about["changes/patch"][0]) == {"fbar": False}
 
@@ -143,7 +147,7 @@ def test_record_without_recorders_carries_on(fbar, fake, tmp_path):
     daemon = fake(recorders=False)
     daemon.advance(20, live=False)
     result = fbar("record", "r1", "-o", "a.h5", url=daemon.url)
-    assert result.returncode == 0 and "recorders" in result.stderr
+    assert result.returncode == 0 and result.stderr == ""  # a reason to speak is a frame that is gone
     check_frames(tmp_path / "a.h5", daemon.frames)
 
 
@@ -352,14 +356,46 @@ def test_record_into_no_folder_is_an_io_error(fbar, fake):
     assert fbar("record", "r1", "-o", "none/a.h5", url=daemon.url).returncode == 4
 
 
-def test_record_a_gone_frame_is_said(fbar, fake):
-    daemon = fake()
+@pytest.mark.parametrize("recorders", [True, False])
+def test_record_a_gone_frame_is_said(fbar, fake, recorders):
+    daemon = fake(recorders=recorders)
     daemon.advance(20, live=False)
     route = daemon.route
     daemon.route = lambda m, p, b, h: ((404, "application/json", b"{}") if p.endswith("/frames/3")
                                        else route(m, p, b, h))
     result = fbar("record", "r1", "-o", "a.h5", url=daemon.url)
     assert result.returncode == 4 and "frame 3" in result.stderr
+    assert ("recorders" in result.stderr) == (not recorders)
+
+
+# (probe of the scene, column of the daemon's CSV, unit in 2D, in 3D)
+PROBES = [
+    ({"kind": "extent", "axis": "y", "side": "min"}, "p", "m", "m"),
+    ({"kind": "displacement", "at": [0, 0]}, "p.x", "m", "m"),
+    ({"kind": "reaction", "wall": "floor"}, "p.x", "N/m", "N"),
+    ({"kind": "energy"}, "p.kinetic", "J/m", "J"),
+    ({"kind": "momentum"}, "p.x", "kg/s", "kg m/s"),
+    ({"kind": "drift"}, "p", "1", "1"),
+    ({"kind": "field", "field": "velocity", "at": [0, 0]}, "p.x", "m/s", "m/s"),
+    ({"kind": "maximum", "field": "density"}, "p", "kg/m^3", "kg/m^3"),  # in no frame
+    ({"kind": "mean", "field": "volume_ratio"}, "p", "1", "1"),
+    ({"kind": "mean", "field": "soon"}, "p", "unknown", "unknown"),
+    ({"kind": "minimum", "field": "mean_stress", "scale": -1}, "p", "Pa", "Pa"),
+    ({"kind": "minimum", "field": "mean_stress", "scale": 1e-3}, "p", "scaled Pa", "scaled Pa")]
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_record_probes_have_units(fbar, fake, tmp_path, dimension):
+    daemon = fake(n_frames=2, dimension=dimension, count=8)
+    daemon.scene = {"probes": {f"p{i}": probe for i, (probe, _, _, _) in enumerate(PROBES)}}
+    columns = [column.replace("p", f"p{i}", 1) for i, (_, column, _, _) in enumerate(PROBES)]
+    daemon.probes_csv = ",".join(["step,time", *columns]) + "\r\n0,0" + ",1" * len(PROBES) + "\r\n"
+    daemon.advance(2, live=False)
+    assert fbar("record", "r1", "-o", "a.h5", url=daemon.url).returncode == 0
+    with h5py.File(tmp_path / "a.h5") as f:
+        about = [f[f"fbard/probes/p{i}/value"].attrs for i in range(len(PROBES))]
+        assert [a["unit"].decode() for a in about] == [row[dimension] for row in PROBES]
+        assert about[-1]["long_name"] == b"minimum of mean_stress, times 0.001"
 
 
 def test_record_compressed_holds_the_same(fbar, fake, tmp_path):
@@ -428,8 +464,7 @@ print("RESULT " + json.dumps(out))
 @pytest.mark.long
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_record_xdmf_opens_in_paraview(fbar, fake, tmp_path, dimension):
-    if not shutil.which("pvpython"):
-        pytest.skip("pvpython is not installed")
+    assert shutil.which("pvpython"), "pvpython is not installed: make deps-long"
     daemon = fake(n_frames=5, dimension=dimension)
     daemon.frames[2] = fake(n_frames=5, dimension=dimension, count=40).frames[2]  # counts may differ
     daemon.advance(5, live=False)

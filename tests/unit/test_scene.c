@@ -810,6 +810,43 @@ static void test_scene_reads_plastic_materials(void **state) {
     }
 }
 
+// What the keys and what the solver finds wrong come together, as far as the scene can be built.
+static void test_scene_reports_the_solver_s_faults_with_its_own(void **state) {
+    (void)state;
+    static const char *const patches[] = {
+        "{\"time\":{\"dt\":1},\"foo\":1}",
+        "{\"time\":{\"dt\":1},\"materials\":{\"water\":{\"foo\":1}}}",
+        "{\"time\":{\"dt\":1},\"gravity\":[0,\"g\"]}",
+        "{\"time\":{\"dt\":1},\"probes\":{\"front\":{\"kind\":\"colour\"}}}",
+        "{\"time\":{\"dt\":1},\"output\":7}",
+        "{\"time\":{\"dt\":1},\"references\":[{\"probe\":\"nothing\"}]}",
+        "{\"time\":{\"dt\":1},\"loads\":{\"a\":1}}",
+    };
+    for (size_t i = 0; i < sizeof patches / sizeof *patches; i++) {
+        cJSON *json = patched_base(patches[i]);
+        struct faults faults = {0};
+        assert_null(scene_create(json, &faults));
+        if (faults.count < 2 || !has_fault(&faults, "/time/dt", "unstable_dt"))
+            print_error("%s: %zu faults\n", patches[i], faults.count);
+        assert_true(faults.count >= 2);
+        assert_true(has_fault(&faults, "/time/dt", "unstable_dt"));
+        faults_free(&faults);
+        cJSON_Delete(json);
+    }
+    // What hangs on the fault is left alone.
+    assert_fault("{\"time\":{\"dt\":1},\"cell\":\"a\"}", "/cell", "type");
+    assert_fault(
+        "{\"time\":{\"dt\":1},\"bodies\":{\"ball\":{\"shape\":{\"disk\":null,\"foo\":1}}}}",
+        "/bodies/ball/shape/foo", "unknown_key");
+}
+
+static void test_scene_refuses_what_no_run_can_give(void **state) {
+    (void)state;
+    assert_fault("{\"output\":{\"fields\":[\"velocity\",\"plastic_strain\"]}}", "/output/fields/1",
+                 "unsupported");
+    assert_fault("{\"time\":{\"end\":1e300}}", "/time/end", "range");
+}
+
 // ---- The definition -----------------------------------------------------------------------------
 
 static void test_scene_definition_follows_the_scene(void **state) {
@@ -1132,7 +1169,7 @@ static void test_config_patch_refuses_the_rest(void **state) {
     assert_patch_refused(scene, "{\"transfer\":null}", "/transfer", "immutable");
     assert_patch_refused(scene, "{\"time\":{\"unstable_ok\":true}}", "/time/unstable_ok",
                          "immutable");
-    assert_patch_refused(scene, "{\"time\":{\"dt\":1e-4}}", "/time/cfl", "conflict");
+    assert_patch_refused(scene, "{\"time\":{\"dt\":1e-4}}", "/time/dt", "conflict");
     assert_patch_refused(scene, "{\"damping\":{\"local\":2}}", "/damping/local", "range");
     assert_patch_refused(scene, "{\"damping\":{\"locl\":0.2}}", "/damping/locl", "unknown_key");
     assert_patch_refused(scene, "{\"gravty\":[0,0]}", "/gravty", "unknown_key");
@@ -1370,6 +1407,8 @@ int main(int argc, char **argv) {
         cmocka_unit_test(test_scene_reads_rigid_bodies),
         cmocka_unit_test(test_scene_refuses_bad_rigid_bodies),
         cmocka_unit_test(test_scene_reads_plastic_materials),
+        cmocka_unit_test(test_scene_reports_the_solver_s_faults_with_its_own),
+        cmocka_unit_test(test_scene_refuses_what_no_run_can_give),
         cmocka_unit_test(test_scene_definition_follows_the_scene),
         cmocka_unit_test(test_scene_stages_state_settings_and_keep_changes),
         cmocka_unit_test(test_scene_in_three_dimensions),
