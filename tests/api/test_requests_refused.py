@@ -532,7 +532,7 @@ def test_two_runs_of_one_id_at_the_same_moment_are_one_201_and_the_rest_409(daem
     [
         ({"id": "a/b"}, "/id", '"a/b"'), ({"id": ""}, "/id", '""'), ({"id": "x" * 65}, "/id", "x" * 65),
         ({"wait_subscribers": 3}, "/wait_subscribers", "3"), ({"wait_subscribers": 1.5}, "/wait_subscribers", "1.5"),
-        ({"overrides": {"loads": {"a": 1}}}, "/scene/loads", "object"), ({"idd": "a"}, "/idd", "idd"),
+        ({"overrides": {"loads": {"a": 1}}}, "/scene/loads/a", "1"), ({"idd": "a"}, "/idd", "idd"),
     ],
 )  # fmt: skip
 def test_actual_is_told_where_it_is_at_hand(daemon, more, pointer, actual):
