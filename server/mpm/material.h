@@ -1,6 +1,8 @@
 // Inside of a constitutive model: one file in material/ with one descriptor, one line in
 // material.c.
 #pragma once
+#include <float.h>
+
 #include "server/mpm/mpm.h"
 #include "server/mpm/tensor.h"
 
@@ -34,6 +36,19 @@ struct mpm_material {
     // Strain energy per reference volume, J/m^3, of particle p.
     double (*energy)(const struct mpm_particles *s, size_t p);
 };
+
+// Parameters that several models have. The density is every model's first.
+// clang-format off
+#define MPM_DENSITY_PARAMETER                                                                      \
+    {.key = "density", .unit = "kg/m^3", .doc = "reference density",                               \
+     .min = 0, .min_open = true, .max = DBL_MAX, .required = true}
+#define MPM_YOUNGS_MODULUS_PARAMETER                                                               \
+    {.key = "youngs_modulus", .unit = "Pa", .doc = "Young's modulus at rest",                      \
+     .min = 0, .min_open = true, .max = DBL_MAX, .required = true}
+#define MPM_POISSON_RATIO_PARAMETER                                                                \
+    {.key = "poisson_ratio", .unit = "1", .doc = "Poisson's ratio at rest",                        \
+     .min = -1, .min_open = true, .max = 0.5, .max_open = true, .required = true}
+// clang-format on
 
 // Stamps out the 2D and 3D entry points of a kernel written once with a `const int dim`.
 #define MPM_STRESS_2D_3D(kernel)                                                                   \

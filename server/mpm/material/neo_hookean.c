@@ -7,28 +7,9 @@
 enum { DENSITY, YOUNGS_MODULUS, POISSON_RATIO };
 
 static const struct mpm_parameter parameters[] = {
-    [DENSITY] = {.key = "density",
-                 .unit = "kg/m^3",
-                 .doc = "reference density",
-                 .min = 0,
-                 .min_open = true,
-                 .max = DBL_MAX,
-                 .required = true},
-    [YOUNGS_MODULUS] = {.key = "youngs_modulus",
-                        .unit = "Pa",
-                        .doc = "Young's modulus at rest",
-                        .min = 0,
-                        .min_open = true,
-                        .max = DBL_MAX,
-                        .required = true},
-    [POISSON_RATIO] = {.key = "poisson_ratio",
-                       .unit = "1",
-                       .doc = "Poisson's ratio at rest",
-                       .min = -1,
-                       .min_open = true,
-                       .max = 0.5,
-                       .max_open = true,
-                       .required = true},
+    [DENSITY] = MPM_DENSITY_PARAMETER,
+    [YOUNGS_MODULUS] = MPM_YOUNGS_MODULUS_PARAMETER,
+    [POISSON_RATIO] = MPM_POISSON_RATIO_PARAMETER,
     {.key = NULL},
 };
 

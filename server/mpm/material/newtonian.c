@@ -7,13 +7,7 @@
 enum { DENSITY, BULK_MODULUS, VISCOSITY };
 
 static const struct mpm_parameter parameters[] = {
-    [DENSITY] = {.key = "density",
-                 .unit = "kg/m^3",
-                 .doc = "reference density",
-                 .min = 0,
-                 .min_open = true,
-                 .max = DBL_MAX,
-                 .required = true},
+    [DENSITY] = MPM_DENSITY_PARAMETER,
     [BULK_MODULUS] = {.key = "bulk_modulus",
                       .unit = "Pa",
                       .doc = "bulk modulus",
