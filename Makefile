@@ -29,7 +29,7 @@ WARN = -Wall -Wextra -Wpedantic -Wshadow -Wstrict-prototypes -Wmissing-prototype
 CFLAGS.release = -O3 -g
 CFLAGS.debug = -O0 -g3
 CFLAGS.clang = -O2 -g
-CFLAGS.asan = -O1 -g -fsanitize=address,undefined -fno-sanitize-recover=all -fno-omit-frame-pointer
+CFLAGS.asan = -O2 -g -fsanitize=address,undefined -fno-sanitize-recover=all -fno-omit-frame-pointer
 CFLAGS.tsan = -O1 -g -fsanitize=thread
 CFLAGS.coverage = -O0 -g --coverage
 # One meaning of a*b + c for every compiler; no errno, no traps; never -ffast-math.
@@ -53,7 +53,7 @@ SCENES = $(sort $(wildcard scenes/*.json))
 
 obj = $(patsubst %.c,$(B)/obj/%.o,$(1))
 
-.PHONY: all deps deps-long libmpm demo check check-all check-layers check-unit check-physics check-api \
+.PHONY: all programs deps deps-long libmpm demo check check-all check-layers check-unit check-physics check-api \
 	check-cli check-asan check-clang check-long install uninstall format clean help
 .DELETE_ON_ERROR:
 .SECONDARY:
@@ -130,7 +130,11 @@ deps-long: deps
 
 # Everything that a commit must pass. deps first, alone: what follows asks pkg-config.
 check: deps ## build and run all tests (installs what is missing)
+	@$(MAKE) --no-print-directory -j$$(nproc) all programs
 	@$(MAKE) --no-print-directory check-all
+
+# The test programs, built but not run: in parallel, where the tests themselves run one by one.
+programs: $(UNIT) $(PHYSICS)
 
 check-all: all
 	$(Q)$(MAKE) --no-print-directory check-layers check-unit check-physics check-api check-cli
@@ -155,7 +159,8 @@ check-cli: all ## black-box tests of the client
 
 # The same unit and API tests under AddressSanitizer and UBSan.
 check-asan:
-	$(Q)$(MAKE) --no-print-directory VARIANT=asan build/asan/fbard build/asan/fbar check-unit
+	$(Q)$(MAKE) --no-print-directory -j$$(nproc) VARIANT=asan build/asan/fbard build/asan/fbar programs
+	$(Q)$(MAKE) --no-print-directory VARIANT=asan check-unit
 	$(Q)FBARD=$(CURDIR)/build/asan/fbard FBAR=$(CURDIR)/build/asan/fbar $(PYTEST) tests/api
 
 check-clang: ## warnings and unit tests with clang 14
