@@ -26,8 +26,9 @@
     X(EXTENT, "extent")                                                                            \
     X(DISPLACEMENT, "displacement")                                                                \
     X(FIELD, "field")                                                                              \
-    X(REACTION, "reaction") X(MAXIMUM, "maximum") X(MINIMUM, "minimum") X(MEAN, "mean")            \
-        X(ENERGY, "energy") X(MOMENTUM, "momentum") X(DRIFT, "drift")
+    X(REACTION, "reaction")                                                                        \
+    X(MAXIMUM, "maximum") X(MINIMUM, "minimum") X(MEAN, "mean") X(ENERGY, "energy")                \
+        X(MOMENTUM, "momentum") X(DRIFT, "drift")
 
 enum mpm_basis {
 #define X(code, text) MPM_##code,
@@ -367,7 +368,9 @@ struct mpm_balance {
 void mpm_balance(const struct mpm_sim *sim, struct mpm_balance *out);
 
 // Seconds by phase since creation (all 0 without a clock); names are static.
-#define MPM_PHASE_LIST(X) X(P2G, "p2g") X(GRID, "grid") X(G2P, "g2p") X(FBAR, "fbar")
+#define MPM_PHASE_LIST(X)                                                                          \
+    X(SORT, "sort")                                                                                \
+    X(P2G, "p2g") X(CONTACT, "contact") X(GRID, "grid") X(G2P, "g2p") X(FBAR, "fbar")
 enum mpm_phase {
 #define X(code, text) MPM_PHASE_##code,
     MPM_PHASE_LIST(X)
