@@ -5,9 +5,8 @@
 // sum sqrt(2/3) |d eps_p| and sigma_y(a) = residual + (peak - residual) exp(-softening a). With
 // logarithmic strains the return map is the radial return of small strains (Simo 1992), and plastic
 // flow keeps the volume: J = sqrt(det b_e).
-#include <float.h>
-
-#include "server/mpm/particles.h"
+#ifndef MPM_LAW_ONLY
+#include "server/mpm/material_spans.h"
 #include "server/mpm/spectral.h"
 
 enum { DENSITY, YOUNGS_MODULUS, POISSON_RATIO, YIELD_STRENGTH, RESIDUAL_STRENGTH, SOFTENING };
@@ -125,7 +124,7 @@ MPM_KERNEL void stress(struct mpm_particles *s, size_t begin, size_t end, const 
         }
     }
 }
-MPM_STRESS_2D_3D(stress)
+MPM_SPANS_2D_3D(stress)
 
 // mu |dev eps|^2 + K/2 (tr eps)^2, with eps from the stress.
 static double energy(const struct mpm_particles *s, size_t p) {
@@ -153,3 +152,4 @@ const struct mpm_material mpm_material_hencky_j2 = {
     .stress = {stress_2d, stress_3d},
     .energy = energy,
 };
+#endif
