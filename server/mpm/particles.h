@@ -50,6 +50,7 @@ static inline size_t mpm_at(size_t p, int n_components, int c) {
     return (p / MPM_BLOCK * (size_t)n_components + (size_t)c) * MPM_BLOCK + p % MPM_BLOCK;
 }
 
+#if MPM_LANES == 1
 // Volume ratio that the stress uses at particle p: det F; sqrt(det b), since plastic flow keeps the
 // volume; or Jbar of a fluid.
 static inline double mpm_ratio_in_use(const struct mpm_particles *s, size_t p) {
@@ -69,6 +70,7 @@ static inline double mpm_ratio_in_use(const struct mpm_particles *s, size_t p) {
     }
     return mpm_det(F, s->dim);
 }
+#endif
 
 // Mean normal stress of particle p, Pa.
 double mpm_mean_stress(const struct mpm_particles *s, size_t p);
