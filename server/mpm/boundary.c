@@ -240,7 +240,7 @@ static void keep_real(struct mpm_wall *w, const struct mpm_grid *g, const double
             const double *node = sums(g, nodes[q]);
             out[0] = node[0];
             for (int d = 0; d < dim; d++) {
-                out[1 + d] = node[1 + dim + d] + node[0] * gravity[d];
+                out[1 + d] = node[MPM_NODE_FORCE + d] + node[0] * gravity[d];
             }
         }
     }
@@ -253,7 +253,7 @@ static void open_columns(const struct mpm_wall *walls, size_t n_walls, struct mp
     const int dim = g->dim, axis = w->def.axis;
     for (size_t k = 0; k < w->n_columns; k++) {
         const double *plane = sums(g, w->column[k].plane), m = plane[0];
-        const double v = m > 0 ? (plane[1 + axis] + dt * plane[1 + dim + axis]) / m +
+        const double v = m > 0 ? (plane[1 + axis] + dt * plane[MPM_NODE_FORCE + axis]) / m +
                                      dt * gravity[axis] - w->def.velocity[axis]
                                : 0;
         w->open[k] = w->def.keeps_above ? v > 0 : v < 0;
@@ -284,9 +284,9 @@ static void fold(const struct mpm_wall *w, struct mpm_grid *g, const double *gra
         const double m_ghost = ghost[0];
         for (int d = 0; d < dim; d++) {
             const double s = parity(w, d), v_wall = w->def.velocity[d];
-            double *p = &inner[1 + d], *f = &inner[1 + dim + d];
+            double *p = &inner[1 + d], *f = &inner[MPM_NODE_FORCE + d];
             *p += s * ghost[1 + d];
-            *f += s * ghost[1 + dim + d];
+            *f += s * ghost[MPM_NODE_FORCE + d];
             if (s < 0) {
                 // The image moves at 2 v_wall - v; its weight points the other way, and the gravity
                 // that the grid update adds for its mass is taken back twice.
@@ -364,7 +364,7 @@ static void apply_direct(const struct mpm_wall *walls, struct mpm_wall *w, struc
     const int dim = g->dim;
     memset(w->reaction, 0, sizeof w->reaction);
     for (const struct mpm_column *c = w->column; c < w->column + w->n_columns; c++) {
-        const double *node = sums(g, c->plane), m = node[0], *f = node + 1 + dim;
+        const double *node = sums(g, c->plane), m = node[0], *f = node + MPM_NODE_FORCE;
         if (!(m > 0)) {
             continue;
         }

@@ -74,10 +74,38 @@ static bool reserve(struct mpm_grid *g, uint32_t capacity) {
     return true;
 }
 
-bool mpm_grid_create(struct mpm_grid *grid, const struct mpm_def *def) {
+// For every cell: the stencil of a block whose neighbours begin at 0, 256, 512, ...
+static void fill_tables(struct mpm_grid *g, int support) {
+    uint32_t slot = 0, near[1][8], nodes[MPM_MAX_STENCIL];
+    for (uint32_t k = 0; k < 8; k++) {
+        near[0][k] = k << 8;
+    }
+    const struct mpm_grid one = {.dim = g->dim, .slot = &slot, .near = near};
+    const int n = g->dim == 2 ? support * support : support * support * support;
+    for (uint32_t cell = 0; cell < (uint32_t)MPM_BLOCK_NODES(g->dim); cell++) {
+        if (g->dim == 2) {
+            mpm_grid_stencil(&one, cell, support, 2, nodes);
+        } else {
+            mpm_grid_stencil(&one, cell, support, 3, nodes);
+        }
+        for (int k = 0; k < n; k++) {
+            g->which[cell * MPM_MAX_STENCIL + (uint32_t)k] = (uint8_t)(nodes[k] >> 8);
+            g->place[cell * MPM_MAX_STENCIL + (uint32_t)k] = (uint8_t)(nodes[k] & 255);
+        }
+    }
+}
+
+bool mpm_grid_create(struct mpm_grid *grid, const struct mpm_def *def, int support) {
     if (!mpm_grid_layout(grid, def)) {
         return false;
     }
+    const size_t cells = (size_t)MPM_BLOCK_NODES(grid->dim);
+    grid->which = calloc(2 * cells, MPM_MAX_STENCIL);
+    if (!grid->which) {
+        return false;
+    }
+    grid->place = grid->which + cells * MPM_MAX_STENCIL;
+    fill_tables(grid, support);
     grid->n_slots = 1;
     grid->slot = calloc(n_blocks(grid), sizeof *grid->slot);
     grid->block_capacity = FIRST_CAPACITY;
@@ -101,6 +129,7 @@ bool mpm_grid_add_fbar(struct mpm_grid *grid, int scalars) {
 }
 
 void mpm_grid_free(struct mpm_grid *grid) {
+    free(grid->which);
     free(grid->slot);
     free(grid->block);
     free(grid->near);

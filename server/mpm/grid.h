@@ -18,11 +18,14 @@
 #define MPM_EDGE 4 // nodes of a block along each direction
 #define MPM_BLOCK_NODES(dim) ((dim) == 2 ? 16 : 64)
 #define MPM_BLOCK_BITS(dim) (2 * (dim))
-#define MPM_MAX_STENCIL 64 // nodes that a particle reaches at most: 4^3
+#define MPM_MAX_STENCIL 64  // nodes that a particle reaches at most: 4^3
+#define MPM_STENCIL_ROOM 64 // of an array of them, which is filled eight at a time
 
-// One node's sums (P2G), one cache line: m, then dim of momentum, then dim of force, then volume.
+// One node's sums (P2G), one cache line. 2D: m, mv (2), V, f (2); 3D: m, mv (3), f (3), V. So what
+// goes with the weight's gradient, and with it needs more arithmetic, lies in the upper half.
 #define MPM_NODE 8
-#define MPM_NODE_VOLUME(dim) (2 * (dim) + 1)
+#define MPM_NODE_FORCE 4
+#define MPM_NODE_VOLUME(dim) ((dim) == 2 ? 3 : 7)
 // One node's result: dim of v^{n+1}, then dim of v^{n+1} - v^n.
 #define MPM_VELOCITY(dim) (2 * (dim))
 
@@ -36,6 +39,9 @@ struct mpm_grid {
     uint32_t (*near)[8]; // (capacity) first nodes of the 2^dim blocks at +0 and +1 along each
                          // direction, row-major: what a stencil that begins in the block reaches
     uint32_t capacity;   // slots that there is memory for
+    // Of each cell of a block, for the nodes of its stencil: which of the blocks near, and where in
+    // it. Rows of MPM_MAX_STENCIL.
+    uint8_t *which, *place;
     double *node;        // (nodes, MPM_NODE)
     double *velocity;    // (nodes, MPM_VELOCITY)
     double *fbar;        // (nodes, scalars) sums that F-bar averages; NULL while F-bar is off
@@ -46,7 +52,8 @@ struct mpm_grid {
 // Sizes only (no memory). Block and cell of a particle must fit 32 bits: false when the domain has
 // more nodes.
 bool mpm_grid_layout(struct mpm_grid *grid, const struct mpm_def *def);
-bool mpm_grid_create(struct mpm_grid *grid, const struct mpm_def *def);
+// Without blocks. `support`: nodes per direction that a particle reaches.
+bool mpm_grid_create(struct mpm_grid *grid, const struct mpm_def *def, int support);
 // `scalars`: sums that the F-bar scheme averages (1 or 2).
 bool mpm_grid_add_fbar(struct mpm_grid *grid, int scalars);
 void mpm_grid_free(struct mpm_grid *grid);

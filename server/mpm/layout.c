@@ -14,7 +14,9 @@ static bool lay_out(struct mpm_sim *sim) {
         if (!mpm_order_activate(&sim->orders[b], &sim->grid, basis)) {
             return false;
         }
-        most = sim->orders[b].n_tiles > most ? sim->orders[b].n_tiles : most;
+        const size_t tiles = sim->orders[b].n_tiles, chunks = sim->sets[b].n / MPM_CHUNK + 1;
+        most = tiles > most ? tiles : most;
+        most = chunks > most ? chunks : most;
     }
     if (most > sim->n_results) {
         struct mpm_span_result *results =

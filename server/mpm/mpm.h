@@ -30,6 +30,10 @@
     X(MAXIMUM, "maximum") X(MINIMUM, "minimum") X(MEAN, "mean") X(ENERGY, "energy")                \
         X(MOMENTUM, "momentum") X(DRIFT, "drift")
 
+// Instruction sets of the kernels: plain scalar code, and lanes of 4 or 8 (x86-64-v3 and v4).
+#define MPM_ISA_LIST(X)                                                                            \
+    X(AUTO, "auto") X(BASELINE, "baseline") X(AVX2, "avx2") X(AVX512, "avx512")
+
 enum mpm_basis {
 #define X(code, text) MPM_##code,
     MPM_BASIS_LIST(X)
@@ -55,15 +59,27 @@ enum mpm_probe_kind {
         MPM_N_PROBE_KINDS
 };
 
+enum mpm_isa {
+#define X(code, text) MPM_ISA_##code,
+    MPM_ISA_LIST(X)
+#undef X
+        MPM_N_ISAS
+};
+// Whether this machine and build have it; what AUTO, or one that they lack, comes to.
+bool mpm_isa_available(enum mpm_isa isa);
+enum mpm_isa mpm_isa_in_use(enum mpm_isa isa);
+
 // The text of an enumerator, static; and the enumerator of a text, or -1.
 const char *mpm_basis_name(enum mpm_basis basis);
 const char *mpm_fbar_name(enum mpm_fbar_scheme scheme);
 const char *mpm_wall_condition_name(enum mpm_wall_condition condition);
 const char *mpm_probe_kind_name(enum mpm_probe_kind kind);
+const char *mpm_isa_name(enum mpm_isa isa);
 int mpm_basis_parse(const char *text);
 int mpm_fbar_parse(const char *text);
 int mpm_wall_condition_parse(const char *text);
 int mpm_probe_kind_parse(const char *text);
+int mpm_isa_parse(const char *text);
 
 // ---- Materials
 // ------------------------------------------------------------------------------------
@@ -261,6 +277,7 @@ struct mpm_def {
         wants_volume_ratio; // a frame will ask for the raw volume ratio, also of fluids under F-bar
     size_t memory_limit;    // bytes, 0 = none
     int n_threads;          // >= 1; results do not depend on it
+    enum mpm_isa isa; // of the kernels; another one changes results by round-off only
     // Wall-clock seconds, to time the phases; NULL = no timing. Called from the stepping thread
     // only.
     double (*clock)(void);

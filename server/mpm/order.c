@@ -69,7 +69,7 @@ static void find_keys(const struct mpm_particles *s, const struct mpm_grid *g, e
     for (size_t p = 0; p < s->n; p++) {
         int base[MPM_MAX_DIM];
         for (int d = 0; d < g->dim; d++) {
-            base[d] = mpm_base(basis, (s->x[mpm_at(p, g->dim, d)] - g->origin[d]) * g->inv_h,
+            base[d] = (int)mpm_base(basis, (s->x[mpm_at(p, g->dim, d)] - g->origin[d]) * g->inv_h,
                                s->half);
         }
         key[p] = g->dim == 2 ? mpm_cell_key(g, base, 2) : mpm_cell_key(g, base, 3);
@@ -277,7 +277,7 @@ bool mpm_activate_around(struct mpm_grid *grid, enum mpm_basis basis, const doub
                          double half) {
     int base[MPM_MAX_DIM];
     for (int d = 0; d < grid->dim; d++) {
-        base[d] = mpm_base(basis, (x[d] - grid->origin[d]) * grid->inv_h, half);
+        base[d] = (int)mpm_base(basis, (x[d] - grid->origin[d]) * grid->inv_h, half);
     }
     const uint32_t key =
         grid->dim == 2 ? mpm_cell_key(grid, base, 2) : mpm_cell_key(grid, base, 3);

@@ -21,7 +21,9 @@ struct mpm_particles {
     uint32_t first_id;  // of the body's particles; their ids are consecutive
     int body, dim;
     const struct mpm_material *material;
+    int law; // enum mpm_law of the material
     double parameters[MPM_MAX_PARAMETERS];
+    double constants[MPM_MAX_CONSTANTS]; // what the law has prepared of them
     double density;          // kg/m^3, reference; a particle's mass is density * V0
     double half, inv_4_half; // uGIMP: half the particle size, in cells; 1 / (4 half)
     bool wants_fbar;         // false: the material is excepted from F-bar

@@ -5,6 +5,8 @@
 #include <stdlib.h>
 #include <string.h>
 
+#include "server/mpm/basis.h"
+#include "server/mpm/laws.h"
 #include "server/mpm/seed.h"
 
 #define STABLE_CFL                                                                                 \
@@ -181,6 +183,7 @@ void mpm_restore_stage(struct mpm_sim *sim) {
         const struct mpm_material_def *m =
             mpm_material_of(sim->def, sim->def->bodies[b].material, sim->c.stage);
         memcpy(s->parameters, m->parameters, sizeof s->parameters);
+        s->material->prepare(s->parameters, s->constants);
         s->density = m->parameters[0];
     }
 }
@@ -323,11 +326,13 @@ static bool create_sets(struct mpm_sim *sim) {
                                     .body = (int)b,
                                     .dim = def->dimension,
                                     .material = m->model,
+                                    .law = (int)mpm_material_law(m->model),
                                     .density = m->parameters[0],
                                     .half = mpm_seed_half(body),
                                     .inv_4_half = 0.25 / mpm_seed_half(body),
                                     .wants_fbar = m->fbar};
         memcpy(s->parameters, m->parameters, sizeof s->parameters);
+        s->material->prepare(s->parameters, s->constants);
         const size_t n = mpm_seed(def, body, NULL, NULL);
         if (!mpm_particles_create(s, n, wanted(def))) {
             return false;
@@ -410,7 +415,9 @@ enum mpm_status mpm_create(const struct mpm_def *def, struct mpm_sim **out, stru
         return mpm_fail(err, MPM_ERR_MEMORY, "", "no memory for the simulation");
     }
     sim->def = def;
-    sim->kernels = mpm_kernels_plain(def->dimension, def->basis);
+    sim->isa = mpm_isa_in_use(def->isa);
+    sim->kernels = mpm_kernels(def->dimension, def->basis, sim->isa);
+    sim->plain = mpm_kernels(def->dimension, def->basis, MPM_ISA_BASELINE);
     sim->n_sets = def->n_bodies;
     sim->sets = calloc(def->n_bodies, sizeof *sim->sets);
     sim->orders = calloc(def->n_bodies, sizeof *sim->orders);
@@ -422,7 +429,7 @@ enum mpm_status mpm_create(const struct mpm_def *def, struct mpm_sim **out, stru
         sim->c.max[d] = -INFINITY;
     }
     if (!sim->sets || !sim->orders || !sim->walls || !sim->loads || !sim->rigids ||
-        !mpm_grid_create(&sim->grid, def) || !create_sets(sim)) {
+        !mpm_grid_create(&sim->grid, def, mpm_support(def->basis)) || !create_sets(sim)) {
         goto fail;
     }
     for (; sim->n_walls < def->n_walls; sim->n_walls++) {
@@ -530,7 +537,7 @@ static bool count_blocks(void *context, const double *x, double volume) {
 void mpm_estimate(const struct mpm_def *def, struct mpm_estimate *out) {
     *out = (struct mpm_estimate){0};
     struct counting c = {.def = def};
-    if (!mpm_grid_create(&c.grid, def)) {
+    if (!mpm_grid_create(&c.grid, def, mpm_support(def->basis))) {
         mpm_grid_free(&c.grid);
         out->bytes = SIZE_MAX;
         return;

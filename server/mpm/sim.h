@@ -7,6 +7,7 @@
 #include "server/mpm/order.h"
 #include "server/mpm/transfer.h"
 
+#define MPM_CHUNK 256 // particles of work that is not by tiles; never depends on the thread count
 #define MPM_AVERAGE_SLOTS 64 // points of a probe's running integral kept over its averaging window
 
 // Running integral of a probe's value over time, for its moving mean.
@@ -40,7 +41,8 @@ struct mpm_clockwork {
 
 struct mpm_sim {
     const struct mpm_def *def; // borrowed
-    const struct mpm_kernels *kernels;
+    enum mpm_isa isa;
+    const struct mpm_kernels *kernels, *plain; // of that instruction set, and of the baseline
     struct mpm_grid grid;
     double exit_min[MPM_MAX_DIM], exit_max[MPM_MAX_DIM]; // m: a particle beyond them has left
     size_t n_sets, n_walls, n_loads, n_rigids, n_particles, n_results;
@@ -50,7 +52,7 @@ struct mpm_sim {
     struct mpm_wall *walls;
     struct mpm_load *loads;
     struct mpm_rigid *rigids;
-    struct mpm_span_result *results; // one a tile of the body with the most
+    struct mpm_span_result *results; // one a tile or chunk of the body with the most
     struct mpm_average *averages;    // (n_probes), NULL where no probe averages
     size_t *probe_particle;          // (n_probes) set and id of the particle of a probe at a point
     size_t *probe_set;

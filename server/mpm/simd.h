@@ -70,8 +70,8 @@ MPM_KERNEL mpm_vec mpm_abs(mpm_vec a) {
 MPM_KERNEL mpm_vec mpm_sqrt(mpm_vec a) {
     return sqrt(a);
 }
-MPM_KERNEL mpm_vec mpm_trunc(mpm_vec a) {
-    return trunc(a);
+MPM_KERNEL mpm_vec mpm_trunc(mpm_vec a) { // |a| < 2^63; trunc would be a call without SSE 4.1
+    return (double)(int64_t)a;
 }
 MPM_KERNEL mpm_vec mpm_floor(mpm_vec a) {
     return floor(a);
@@ -206,14 +206,16 @@ MPM_KERNEL mpm_vec mpm_sqrt(mpm_vec a) {
     return MPM_SIMD(sqrt_pd)(a);
 }
 #define MPM_ADD(a, b) ((a) + (b))
+#define MPM_LESS(a, b) ((a) < (b) ? (a) : (b)) // fmin would be a call
+#define MPM_MORE(a, b) ((a) > (b) ? (a) : (b))
 MPM_KERNEL double mpm_hsum(mpm_vec a) {
     return MPM_FOLD(a, MPM_ADD);
 }
 MPM_KERNEL double mpm_hmin(mpm_vec a) {
-    return MPM_FOLD(a, fmin);
+    return MPM_FOLD(a, MPM_LESS);
 }
 MPM_KERNEL double mpm_hmax(mpm_vec a) {
-    return MPM_FOLD(a, fmax);
+    return MPM_FOLD(a, MPM_MORE);
 }
 
 // y = f(x) where `lanes` has a bit: what the polynomials below leave to libm.
@@ -303,6 +305,151 @@ MPM_KERNEL mpm_vec mpm_cbrt(mpm_vec x) {
 
 #endif
 
+#if MPM_LANES > 1
+
+// Four doubles, whatever MPM_LANES: a row of nodes.
+typedef double mpm_four __attribute__((vector_size(32)));
+MPM_KERNEL mpm_four mpm_load_four(const double *from) {
+    return _mm256_load_pd(from);
+}
+// Components of a node (server/mpm/grid.h) in 3D: bits of those that go with the weight, and of
+// those that go with its gradient, the force.
+MPM_KERNEL mpm_word mpm_sums(const int part) {
+    const uint64_t all = UINT64_MAX;
+#if MPM_LANES == 8
+    (void)part;
+    return (mpm_word){all, all, all, all, 0, 0, 0, all};
+#else
+    return part == 0 ? (mpm_word){all, all, all, all} : (mpm_word){0, 0, 0, all};
+#endif
+}
+MPM_KERNEL mpm_word mpm_forces(const int part) {
+    const uint64_t all = UINT64_MAX;
+#if MPM_LANES == 8
+    (void)part;
+    return (mpm_word){0, 0, 0, 0, all, all, all, 0};
+#else
+    return part == 0 ? (mpm_word){0} : (mpm_word){all, all, all, 0};
+#endif
+}
+// Eight lanes (4 lanes: the given half of them) of *one, but *other in lanes `first` and first + 1,
+// which is 4 or 6.
+MPM_KERNEL mpm_vec mpm_splat_two(const double *one, const double *other, const int first,
+                                 const int part) {
+#if MPM_LANES == 8
+    (void)part;
+    return _mm512_mask_broadcastsd_pd(_mm512_set1_pd(*one), (__mmask8)(3 << first),
+                                      _mm_load_sd(other));
+#else
+    if (part == 0) {
+        return _mm256_set1_pd(*one);
+    }
+    return first == 4 ? _mm256_blend_pd(_mm256_set1_pd(*one), _mm256_set1_pd(*other), 3)
+                      : _mm256_blend_pd(_mm256_set1_pd(*one), _mm256_set1_pd(*other), 12);
+#endif
+}
+// Lanes 6 and 7 of eight added to 4 and 5, and 0 in their place.
+MPM_KERNEL mpm_vec mpm_join_pairs(mpm_vec a, const int part) {
+#if MPM_LANES == 8
+    (void)part;
+    const __m512d swapped = _mm512_permutex_pd(a, 0x4e);
+    return _mm512_maskz_mov_pd(0x3f, _mm512_mask_add_pd(a, 0x30, a, swapped));
+#else
+    if (part == 0) {
+        return a;
+    }
+    const __m128d sum = _mm_add_pd(_mm256_castpd256_pd128(a), _mm256_extractf128_pd(a, 1));
+    return _mm256_insertf128_pd(_mm256_setzero_pd(), sum, 0);
+#endif
+}
+// a where the bits of a lane are all set, 0 where none is.
+MPM_KERNEL mpm_vec mpm_keep(mpm_vec a, mpm_word bits) {
+    return (mpm_vec)((mpm_word)a & bits);
+}
+// The lower half of eight doubles where the upper half of a record is (8 lanes; the lower half is
+// not for use); 4 lanes are that half themselves.
+MPM_KERNEL mpm_vec mpm_load_upper(const double *from) {
+#if MPM_LANES == 8
+    const __m512d a = _mm512_load_pd(from);
+    return _mm512_shuffle_f64x2(a, a, 0x00);
+#else
+    return _mm256_load_pd(from);
+#endif
+}
+// All lanes from `lane` on.
+MPM_KERNEL mpm_mask mpm_from_lane(int lane) {
+#if MPM_LANES == 8
+    return (mpm_mask)_mm512_movm_epi64((__mmask8)(0xffu << lane));
+#else
+    return (mpm_mask)mpm_lane_range(lane, 4);
+#endif
+}
+// Bit i: number[i] differs from number[i - 1], for 64 numbers.
+MPM_KERNEL uint64_t mpm_changes_64(const int32_t *number) {
+    uint64_t bits = 0;
+    for (int i = 0; i < 64; i += 8) {
+        const __m256i now = _mm256_loadu_si256((const __m256i *)(const void *)(number + i));
+        const __m256i before = _mm256_loadu_si256((const __m256i *)(const void *)(number + i - 1));
+        const __m256 same = _mm256_castsi256_ps(_mm256_cmpeq_epi32(now, before));
+        bits |= (uint64_t)(~(unsigned)_mm256_movemask_ps(same) & 0xffu) << i;
+    }
+    return bits;
+}
+// out[i] = from[which[i]] + plus[i], eight at a time, of eight to choose from.
+MPM_KERNEL void mpm_pick_8(const uint32_t *from, const uint8_t *which, const uint8_t *plus,
+                           uint32_t *out) {
+    const __m256i index = _mm256_cvtepu8_epi32(_mm_loadl_epi64((const __m128i *)(const void *)which));
+    const __m256i add = _mm256_cvtepu8_epi32(_mm_loadl_epi64((const __m128i *)(const void *)plus));
+    const __m256i all = _mm256_loadu_si256((const __m256i *)(const void *)from);
+    _mm256_storeu_si256((__m256i *)(void *)out,
+                        _mm256_add_epi32(_mm256_permutevar8x32_epi32(all, index), add));
+}
+MPM_KERNEL void mpm_transpose_rows(__m256d a, __m256d b, __m256d c, __m256d d, double *out,
+                                   const int stride) {
+    const __m256d ab = _mm256_unpacklo_pd(a, b), cd = _mm256_unpacklo_pd(c, d);
+    const __m256d AB = _mm256_unpackhi_pd(a, b), CD = _mm256_unpackhi_pd(c, d);
+    _mm256_store_pd(out, _mm256_permute2f128_pd(ab, cd, 0x20));
+    _mm256_store_pd(out + stride, _mm256_permute2f128_pd(AB, CD, 0x20));
+    _mm256_store_pd(out + 2 * stride, _mm256_permute2f128_pd(ab, cd, 0x31));
+    _mm256_store_pd(out + 3 * stride, _mm256_permute2f128_pd(AB, CD, 0x31));
+}
+// Four components (c and d may be NULL for 0) of four particles, to particle by particle: (4, 4).
+MPM_KERNEL void mpm_transpose_4(const double *a, const double *b, const double *c, const double *d,
+                                double *out) {
+    const __m256d zero = _mm256_setzero_pd();
+    mpm_transpose_rows(_mm256_load_pd(a), _mm256_load_pd(b), c ? _mm256_load_pd(c) : zero,
+                       d ? _mm256_load_pd(d) : zero, out, 4);
+}
+// Eight components of MPM_LANES particles, to particle by particle: row i at out + i * stride.
+#if MPM_LANES == 4
+MPM_KERNEL void mpm_transpose(const mpm_vec *in, double *out, const int stride) {
+    mpm_transpose_rows(in[0], in[1], in[2], in[3], out, stride);
+    mpm_transpose_rows(in[4], in[5], in[6], in[7], out + 4, stride);
+}
+#else
+MPM_KERNEL void mpm_transpose(const mpm_vec *in, double *out, const int stride) {
+    __m512d pair[8], quad[8];
+    for (int i = 0; i < 8; i += 2) { // pair[i]: particles 0 2 4 6 of components i, i + 1
+        pair[i] = _mm512_unpacklo_pd(in[i], in[i + 1]);
+        pair[i + 1] = _mm512_unpackhi_pd(in[i], in[i + 1]);
+    }
+    for (int i = 0; i < 2; i++) { // particles 2i', 2i' + 4 of components 0-3 and 4-7
+        quad[i] = _mm512_shuffle_f64x2(pair[i], pair[i + 2], 0x88);
+        quad[i + 2] = _mm512_shuffle_f64x2(pair[i], pair[i + 2], 0xdd);
+        quad[i + 4] = _mm512_shuffle_f64x2(pair[i + 4], pair[i + 6], 0x88);
+        quad[i + 6] = _mm512_shuffle_f64x2(pair[i + 4], pair[i + 6], 0xdd);
+    }
+    for (int i = 0; i < 2; i++) {
+        _mm512_store_pd(out + i * stride, _mm512_shuffle_f64x2(quad[i], quad[i + 4], 0x88));
+        _mm512_store_pd(out + (2 + i) * stride, _mm512_shuffle_f64x2(quad[i + 2], quad[i + 6], 0x88));
+        _mm512_store_pd(out + (4 + i) * stride, _mm512_shuffle_f64x2(quad[i], quad[i + 4], 0xdd));
+        _mm512_store_pd(out + (6 + i) * stride, _mm512_shuffle_f64x2(quad[i + 2], quad[i + 6], 0xdd));
+    }
+}
+#endif
+
+#endif
+
 MPM_KERNEL mpm_vec mpm_load_lanes(const double *from, int first, int last) {
     return mpm_load_lanes_or(from, first, last, 0);
 }
@@ -313,9 +460,18 @@ MPM_KERNEL int mpm_all(mpm_mask mask) {
     return mpm_bits(mask) == (1u << MPM_LANES) - 1;
 }
 // The second where either is NaN.
+#if MPM_LANES == 1
 MPM_KERNEL mpm_vec mpm_min(mpm_vec a, mpm_vec b) {
-    return mpm_select(a < b, a, b);
+    return a < b ? a : b;
 }
 MPM_KERNEL mpm_vec mpm_max(mpm_vec a, mpm_vec b) {
-    return mpm_select(a > b, a, b);
+    return a > b ? a : b;
 }
+#else
+MPM_KERNEL mpm_vec mpm_min(mpm_vec a, mpm_vec b) {
+    return MPM_SIMD(min_pd)(a, b);
+}
+MPM_KERNEL mpm_vec mpm_max(mpm_vec a, mpm_vec b) {
+    return MPM_SIMD(max_pd)(a, b);
+}
+#endif

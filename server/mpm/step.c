@@ -6,37 +6,22 @@
 
 #include "server/mpm/sim.h"
 
+#define TILES_A_TURN 2 // tiles that a thread takes at a time
+#define SLOTS_A_PART 64 // blocks of nodes that a thread takes at a time
 #define UNSTABLE_CFL                                                                               \
     1.0 // no basis is stable at dt >= 0.9 h/c (docs/method.md): beyond this it is not tried
 
-// eq. 9: nodal velocities. Damping acts on the total force, before boundary conditions; FLIP's
-// increment is taken from v^n before boundary conditions.
-MPM_KERNEL void update_nodes(struct mpm_grid *grid, const double *gravity,
-                             const struct mpm_settings *now, double dt, int n_threads,
-                             const int dim) {
-    const double local = now->damping_local, mass = now->damping_mass;
+static void move_nodes(const struct mpm_sim *sim, const struct mpm_motion *motion) {
+    const struct mpm_grid *grid = &sim->grid;
+    const int n_threads = sim->def->n_threads;
+    const uint32_t n_parts = n_threads > 1 ? grid->n_slots / SLOTS_A_PART + 1 : 1;
     (void)n_threads; // without OpenMP
 #pragma omp parallel for schedule(static) num_threads(n_threads) if (n_threads > 1)
-    for (size_t i = MPM_BLOCK_NODES(dim); i < grid->n_slots * (size_t)MPM_BLOCK_NODES(dim); i++) {
-        const double *node = grid->node + i * MPM_NODE;
-        double *velocity = grid->velocity + i * MPM_VELOCITY(dim);
-        const double m = node[0];
-        if (!(m > 0)) {
-            memset(velocity, 0, MPM_VELOCITY(dim) * sizeof *velocity);
-            continue;
-        }
-        const double r = 1 / m;
-        for (int d = 0; d < dim; d++) {
-            const double v = node[1 + d] * r;
-            double f = node[1 + dim + d] + m * gravity[d];
-            if (local != 0 && v != 0) {
-                f -= copysign(local * fabs(f), v);
-            }
-            f -= mass * node[1 + d];
-            const double dv = dt * f * r;
-            velocity[d] = v + dv;
-            velocity[dim + d] = dv;
-        }
+    for (uint32_t k = 0; k < n_parts; k++) {
+        const uint32_t begin = n_parts > 1 ? k * SLOTS_A_PART : 0;
+        const uint32_t end = n_parts > 1 ? begin + SLOTS_A_PART : grid->n_slots;
+        sim->kernels->move_nodes(grid, begin > 1 ? begin : 1,
+                                 end < grid->n_slots ? end : grid->n_slots, motion);
     }
 }
 
@@ -70,35 +55,61 @@ static void join(struct mpm_span_result *joined, const struct mpm_span_result *r
     }
 }
 
-typedef void tile_work(const struct mpm_sim *sim, const struct mpm_span *span,
+typedef void span_work(const struct mpm_sim *sim, const struct mpm_span *span,
                        struct mpm_span_result *result);
 
-// Works on all tiles of a body. What adds to the grid goes colour by colour: tiles of one colour
-// reach no common node, and those of the next wait for them, so that every node's sum has one order
-// whatever the number of threads. What the tiles found is joined in their order.
-static void for_tiles(struct mpm_sim *sim, size_t body, struct mpm_span span, bool adds,
-                      tile_work *work, struct mpm_span_result *joined) {
+static void work_on(const struct mpm_sim *sim, struct mpm_span span, size_t begin, size_t end,
+                    span_work *work, struct mpm_span_result *result) {
+    span.begin = begin;
+    span.end = end;
+    *result = mpm_nothing_found();
+    work(sim, &span, result);
+}
+
+// Work that adds to the grid goes tile by tile and colour by colour: tiles of one colour reach no
+// common node, and those of the next wait for them, so that every node's sum has one order whatever
+// the number of threads.
+static void for_tiles(const struct mpm_sim *sim, size_t body, struct mpm_span span,
+                      span_work *work) {
     const struct mpm_order *order = &sim->orders[body];
-    const int n_threads = sim->def->n_threads, n_colours = adds ? order->n_colours : 1;
+    const int n_threads = sim->def->n_threads;
     (void)n_threads; // without OpenMP
-    span.s = &sim->sets[body];
-    span.grid = &sim->grid;
 #pragma omp parallel num_threads(n_threads) if (n_threads > 1)
-    for (int colour = 0; colour < n_colours; colour++) {
-        const size_t begin = adds ? order->colour_begin[colour] : 0;
-        const size_t end = adds ? order->colour_begin[colour + 1] : order->n_tiles;
-#pragma omp for schedule(dynamic, 1)
-        for (size_t k = begin; k < end; k++) {
-            const size_t t = adds ? order->by_colour[k] : k;
-            struct mpm_span tile = span;
-            tile.begin = order->tile[t].begin;
-            tile.end = order->tile[t].end;
-            sim->results[t] = mpm_nothing_found();
-            work(sim, &tile, &sim->results[t]);
+    for (int colour = 0; colour < order->n_colours; colour++) {
+#pragma omp for schedule(dynamic, TILES_A_TURN)
+        for (size_t k = order->colour_begin[colour]; k < order->colour_begin[colour + 1]; k++) {
+            const size_t t = order->by_colour[k];
+            work_on(sim, span, order->tile[t].begin, order->tile[t].end, work, &sim->results[t]);
         }
     }
-    for (size_t t = 0; joined && t < order->n_tiles; t++) {
-        join(joined, &sim->results[t], span.s);
+}
+
+// All other work goes in chunks of equal size.
+static size_t for_chunks(const struct mpm_sim *sim, struct mpm_span span, span_work *work) {
+    const size_t n = span.s->n, n_chunks = (n + MPM_CHUNK - 1) / MPM_CHUNK;
+    const int n_threads = sim->def->n_threads;
+    (void)n_threads; // without OpenMP
+#pragma omp parallel for schedule(dynamic, 1) num_threads(n_threads) if (n_threads > 1)
+    for (size_t k = 0; k < n_chunks; k++) {
+        const size_t end = (k + 1) * MPM_CHUNK;
+        work_on(sim, span, k * MPM_CHUNK, end < n ? end : n, work, &sim->results[k]);
+    }
+    return n_chunks;
+}
+
+// What was found is joined in the order of the tiles or chunks.
+static void for_particles(const struct mpm_sim *sim, size_t body, struct mpm_span span, bool adds,
+                          span_work *work, struct mpm_span_result *joined) {
+    span.s = &sim->sets[body];
+    span.grid = (struct mpm_grid *)&sim->grid;
+    size_t n = sim->orders[body].n_tiles;
+    if (adds) {
+        for_tiles(sim, body, span, work);
+    } else {
+        n = for_chunks(sim, span, work);
+    }
+    for (size_t k = 0; k < n; k++) {
+        join(joined, &sim->results[k], span.s);
     }
 }
 
@@ -108,14 +119,11 @@ static void p2g(const struct mpm_sim *sim, const struct mpm_span *span, struct m
 
 static void g2p(const struct mpm_sim *sim, const struct mpm_span *span, struct mpm_span_result *r) {
     sim->kernels->g2p(span, r);
-    if (span->fbar) { // while the tile is in the cache
-        sim->kernels->fbar_scatter[sim->c.now.fbar.scheme](span);
-    }
 }
 
-static void finish(const struct mpm_sim *sim, const struct mpm_span *span,
-                   struct mpm_span_result *r) {
-    sim->kernels->fbar_finish[sim->c.now.fbar.scheme](span, r);
+static void fbar(const struct mpm_sim *sim, const struct mpm_span *span,
+                 struct mpm_span_result *r) {
+    sim->kernels->fbar(span, r);
 }
 
 static enum mpm_status step_failure(const struct mpm_sim *sim, enum mpm_status status, double time,
@@ -274,7 +282,7 @@ static void particles_to_grid(struct mpm_sim *sim, double dt, bool any_fbar, dou
     clear_nodes(&sim->grid, any_fbar, sim->def->n_threads);
     for (size_t b = 0; b < sim->n_sets; b++) {
         const struct mpm_span span = {.dt = dt, .fbar = any_fbar && sim->sets[b].wants_fbar};
-        for_tiles(sim, b, span, true, p2g, &found);
+        for_particles(sim, b, span, true, p2g, &found);
     }
     sim->c.runs = found.n_runs;
     sim->c.runs_at_sort = sim->c.steps_since_sort == 0 ? found.n_runs : sim->c.runs_at_sort;
@@ -284,7 +292,7 @@ static void particles_to_grid(struct mpm_sim *sim, double dt, bool any_fbar, dou
         struct mpm_particles *s = &sim->sets[load->def.body];
         if (load->active) {
             mpm_load_update(load, s, sim->c.time - mpm_start_time(sim));
-            sim->kernels->force(&(struct mpm_span){.s = s, .grid = &sim->grid}, load->place,
+            sim->plain->force(&(struct mpm_span){.s = s, .grid = &sim->grid}, load->place,
                                 load->force, load->n);
         }
     }
@@ -292,7 +300,7 @@ static void particles_to_grid(struct mpm_sim *sim, double dt, bool any_fbar, dou
         struct mpm_rigid *rigid = &sim->rigids[k];
         memset(rigid->reaction, 0, sizeof rigid->reaction);
         for (size_t b = 0; rigid->active && b < sim->n_sets; b++) {
-            mpm_contact_forces(rigid, sim->kernels, &sim->sets[b], &sim->grid, dt);
+            mpm_contact_forces(rigid, sim->plain, &sim->sets[b], &sim->grid, dt);
         }
     }
     if (sim->n_loads + sim->n_rigids > 0) {
@@ -308,7 +316,7 @@ enum mpm_status mpm_step(struct mpm_sim *sim, struct mpm_error *err) {
     if (cfl > UNSTABLE_CFL && !sim->def->unstable_ok) {
         return step_failure(sim, MPM_ERR_UNSTABLE_DT, time, -1, "CFL number", cfl, err);
     }
-    double gravity[MPM_MAX_DIM];
+    double gravity[MPM_MAX_DIM] = {0};
     mpm_gravity_at(sim, sim->c.time, gravity);
     double clock = now_or_zero(sim);
     if (sort_is_due(&sim->c)) {
@@ -327,21 +335,24 @@ enum mpm_status mpm_step(struct mpm_sim *sim, struct mpm_error *err) {
 
     // Grid, eq. 9, and boundary conditions
     mpm_walls_fold(sim->walls, sim->n_walls, &sim->grid, gravity, dt);
-    if (dim == 2) {
-        update_nodes(&sim->grid, gravity, now, dt, n_threads, 2);
-    } else {
-        update_nodes(&sim->grid, gravity, now, dt, n_threads, 3);
-    }
+    move_nodes(sim, &(struct mpm_motion){.dt = dt,
+                                         .local = now->damping_local,
+                                         .mass = now->damping_mass,
+                                         .gravity = {gravity[0], gravity[1], gravity[2]}});
     mpm_walls_apply(sim->walls, sim->n_walls, &sim->grid, gravity, dt);
     charge(sim, MPM_PHASE_GRID, &clock);
 
     // G2P, eqs. 11-17; with F-bar, eq. 19 (Algorithm 1, step 3) with it
     struct mpm_span_result found = mpm_nothing_found();
     for (size_t b = 0; b < sim->n_sets; b++) {
-        const bool fbar = any_fbar && sim->sets[b].wants_fbar;
-        const struct mpm_span span = {
-            .dt = dt, .blend = now->blend, .fbar = fbar, .a = now->fbar.a, .C = now->fbar.C};
-        for_tiles(sim, b, span, fbar, g2p, &found);
+        const bool averaged = any_fbar && sim->sets[b].wants_fbar;
+        const struct mpm_span span = {.dt = dt,
+                                      .blend = now->blend,
+                                      .fbar = averaged,
+                                      .scheme = scheme,
+                                      .a = now->fbar.a,
+                                      .C = now->fbar.C};
+        for_particles(sim, b, span, averaged, g2p, &found);
     }
     charge(sim, MPM_PHASE_G2P, &clock);
 
@@ -350,8 +361,8 @@ enum mpm_status mpm_step(struct mpm_sim *sim, struct mpm_error *err) {
         mpm_fbar_average(&sim->grid, sim->walls, sim->n_walls, n_threads);
         for (size_t b = 0; b < sim->n_sets; b++) {
             if (sim->sets[b].wants_fbar) {
-                const struct mpm_span span = {.fbar = true, .C = now->fbar.C};
-                for_tiles(sim, b, span, false, finish, &found);
+                const struct mpm_span span = {.fbar = true, .scheme = scheme, .C = now->fbar.C};
+                for_particles(sim, b, span, false, fbar, &found);
             }
         }
         charge(sim, MPM_PHASE_FBAR, &clock);

@@ -1,13 +1,14 @@
 // Particle-grid transfers: the plain scalar kernels, written once for every dimension and basis.
 //
-// They follow docs/method.md equation by equation and stay as the baseline that faster kernels are
-// checked against. Zhao, Jiang, Choo, eqs. 7-17; F-bar: their Algorithm 1, and docs/method.md
+// They follow docs/method.md equation by equation: the baseline that server/mpm/transfer_lanes.c is
+// checked against, and what runs where its instruction sets are missing. Zhao, Jiang, Choo, eqs. 7-17; F-bar: their Algorithm 1, and docs/method.md
 // section 4 for the anchored scheme.
 #include "server/mpm/transfer.h"
 
 #include <stdint.h>
 
 #include "server/mpm/basis.h"
+#include "server/mpm/kernels.h"
 
 #define BATCH 64 // particles whose velocity gradient is kept for one call of a material's rate part
 
@@ -25,7 +26,7 @@ MPM_KERNEL void stencil_at(struct stencil *t, const struct mpm_span *span, size_
     int base[MPM_MAX_DIM];
     for (int d = 0; d < dim; d++) {
         const double xi = (span->s->x[mpm_at(p, dim, d)] - g->origin[d]) * g->inv_h;
-        base[d] = mpm_weights(basis, xi, span->s->half, span->s->inv_4_half, t->w[d], t->dw[d]);
+        base[d] = (int)mpm_weights(basis, xi, span->s->half, span->s->inv_4_half, t->w[d], t->dw[d]);
     }
     const uint32_t key = mpm_cell_key(g, base, dim);
     if (key != t->key) {
@@ -86,12 +87,33 @@ MPM_KERNEL void p2g(const struct mpm_span *span, struct mpm_span_result *result,
                 node[MPM_NODE_VOLUME(dim)] += w * V_row;
                 for (int d = 0; d < dim; d++) {
                     node[1 + d] += w * mv_row[d];
-                    node[1 + dim + d] += w * f_w[d] + dw * f_dw[d];
+                    node[MPM_NODE_FORCE + d] += w * f_w[d] + dw * f_dw[d];
                 }
             }
         }
     }
     result->n_runs = t.n_runs;
+}
+
+MPM_KERNEL void move_nodes(const struct mpm_grid *grid, uint32_t begin, uint32_t end,
+                           const struct mpm_motion *by, const int dim) {
+    const size_t nodes = MPM_BLOCK_NODES(dim);
+    for (size_t i = begin * nodes; i < end * nodes; i++) {
+        const double *node = grid->node + i * MPM_NODE, m = node[0];
+        double *velocity = grid->velocity + i * MPM_VELOCITY(dim);
+        const double r = m > 0 ? 1 / m : 0;
+        for (int d = 0; d < dim; d++) {
+            const double v = node[1 + d] * r;
+            double f = node[MPM_NODE_FORCE + d] + m * by->gravity[d];
+            if (by->local != 0 && v != 0) {
+                f -= copysign(by->local * fabs(f), v);
+            }
+            f -= by->mass * node[1 + d];
+            const double dv = by->dt * f * r;
+            velocity[d] = v + dv;
+            velocity[dim + d] = dv;
+        }
+    }
 }
 
 MPM_KERNEL void force(const struct mpm_span *span, const uint32_t *particle, const double *f,
@@ -105,7 +127,7 @@ MPM_KERNEL void force(const struct mpm_span *span, const uint32_t *particle, con
             for (int c = 0; c < mpm_support(basis); c++) {
                 const double w = ROW_WEIGHT(t, dim) * t.w[dim - 1][c];
                 for (int d = 0; d < dim; d++) {
-                    g->node[(size_t)row[c] * MPM_NODE + (size_t)(1 + dim + d)] +=
+                    g->node[(size_t)row[c] * MPM_NODE + (size_t)(MPM_NODE_FORCE + d)] +=
                         w * f[k * (size_t)dim + (size_t)d];
                 }
             }
@@ -382,12 +404,7 @@ MPM_KERNEL void fbar_finish(const struct mpm_span *span, struct mpm_span_result 
     *result = r;
 }
 
-// ---- The table
-// ------------------------------------------------------------------------------------
-
-#define KERNELS(X)                                                                                 \
-    X(2, LINEAR)                                                                                   \
-    X(2, GIMP) X(2, BSPLINE2) X(2, BSPLINE3) X(3, LINEAR) X(3, GIMP) X(3, BSPLINE2) X(3, BSPLINE3)
+// ---- The tables ----
 
 #define DEFINE(D, B)                                                                               \
     static void p2g_##D##d_##B(const struct mpm_span *span, struct mpm_span_result *result) {      \
@@ -405,37 +422,35 @@ MPM_KERNEL void fbar_finish(const struct mpm_span *span, struct mpm_span_result 
             g2p(span, result, D, MPM_##B, MPM_KEEPS_B);                                            \
             break;                                                                                 \
         }                                                                                          \
+        if (span->fbar && span->scheme == MPM_FBAR_ZHAO) {                                         \
+            fbar_scatter(span, D, MPM_##B, MPM_FBAR_ZHAO);                                         \
+        } else if (span->fbar) {                                                                   \
+            fbar_scatter(span, D, MPM_##B, MPM_FBAR_ANCHORED);                                     \
+        }                                                                                          \
+    }                                                                                              \
+    static void move_nodes_##D##d_##B(const struct mpm_grid *grid, uint32_t begin, uint32_t end,   \
+                                      const struct mpm_motion *motion) {                           \
+        move_nodes(grid, begin, end, motion, D);                                                   \
     }                                                                                              \
     static void force_##D##d_##B(const struct mpm_span *span, const uint32_t *particle,            \
                                  const double *f, size_t n) {                                      \
         force(span, particle, f, n, D, MPM_##B);                                                   \
     }                                                                                              \
-    static void scatter_zhao_##D##d_##B(const struct mpm_span *span) {                             \
-        fbar_scatter(span, D, MPM_##B, MPM_FBAR_ZHAO);                                             \
-    }                                                                                              \
-    static void scatter_anchored_##D##d_##B(const struct mpm_span *span) {                         \
-        fbar_scatter(span, D, MPM_##B, MPM_FBAR_ANCHORED);                                         \
-    }                                                                                              \
-    static void finish_zhao_##D##d_##B(const struct mpm_span *span,                                \
-                                       struct mpm_span_result *result) {                           \
-        fbar_finish(span, result, D, MPM_##B, MPM_FBAR_ZHAO);                                      \
-    }                                                                                              \
-    static void finish_anchored_##D##d_##B(const struct mpm_span *span,                            \
-                                           struct mpm_span_result *result) {                       \
-        fbar_finish(span, result, D, MPM_##B, MPM_FBAR_ANCHORED);                                  \
+    static void fbar_##D##d_##B(const struct mpm_span *span, struct mpm_span_result *result) {     \
+        if (span->scheme == MPM_FBAR_ZHAO) {                                                       \
+            fbar_finish(span, result, D, MPM_##B, MPM_FBAR_ZHAO);                                  \
+        } else {                                                                                   \
+            fbar_finish(span, result, D, MPM_##B, MPM_FBAR_ANCHORED);                              \
+        }                                                                                          \
     }
-KERNELS(DEFINE)
+MPM_EACH_KERNEL(DEFINE)
 
 #define ENTRY(D, B)                                                                                \
     [(D - 2) * MPM_N_BASES + MPM_##B] = {                                                          \
         .p2g = p2g_##D##d_##B,                                                                     \
-        .force = force_##D##d_##B,                                                                 \
+        .move_nodes = move_nodes_##D##d_##B,                                                       \
         .g2p = g2p_##D##d_##B,                                                                     \
-        .fbar_scatter = {NULL, scatter_zhao_##D##d_##B, scatter_anchored_##D##d_##B},              \
-        .fbar_finish = {NULL, finish_zhao_##D##d_##B, finish_anchored_##D##d_##B},                 \
+        .fbar = fbar_##D##d_##B,                                                                   \
+        .force = force_##D##d_##B,                                                                 \
     },
-static const struct mpm_kernels table[] = {KERNELS(ENTRY)};
-
-const struct mpm_kernels *mpm_kernels_plain(int dim, enum mpm_basis basis) {
-    return &table[(dim - 2) * MPM_N_BASES + (int)basis];
-}
+const struct mpm_kernels mpm_kernels_plain[2 * MPM_N_BASES] = {MPM_EACH_KERNEL(ENTRY)};

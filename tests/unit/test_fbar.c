@@ -150,13 +150,13 @@ static void step_with_affine_velocity(struct mpm_sim *sim, const double *A) {
                                   .dt = DT,
                                   .a = sim->c.now.fbar.a,
                                   .C = sim->c.now.fbar.C,
-                                  .fbar = true};
+                                  .fbar = true,
+                                  .scheme = scheme};
     struct mpm_span_result result;
     sim->kernels->p2g(&span, &result);
     sim->kernels->g2p(&span, &result);
-    sim->kernels->fbar_scatter[scheme](&span);
     mpm_fbar_average(g, NULL, 0, 1);
-    sim->kernels->fbar_finish[scheme](&span, &result);
+    sim->kernels->fbar(&span, &result);
     assert_true(result.bad == SIZE_MAX);
 }
 
@@ -220,7 +220,7 @@ static void reference_step(const struct mpm_sim *before, const struct mpm_sim *a
                 int base[3] = {0};
                 for (int d = 0; d < dim; d++) {
                     const double x = s->x[mpm_at(p, dim, d)];
-                    base[d] = mpm_weights(before->def->basis, (x - g->origin[d]) / g->h, s->half,
+                    base[d] = (int)mpm_weights(before->def->basis, (x - g->origin[d]) / g->h, s->half,
                                           s->inv_4_half, w[d], dw);
                     moved += pow(t->x[mpm_at(p, dim, d)] - x, 2);
                 }

@@ -162,7 +162,7 @@ static void test_load_total_is_the_given_force(void **state) {
         step(sim); // from rest: nodal forces are the load's alone
         FOR_NODES(&sim->grid, i) {
             for (int d = 0; d < dim; d++) {
-                nodes[d] += sim->grid.node[i * MPM_NODE + 1 + (size_t)(dim + d)];
+                nodes[d] += sim->grid.node[i * MPM_NODE + (size_t)(MPM_NODE_FORCE + d)];
             }
         }
         for (int d = 0; d < dim; d++) {

@@ -146,7 +146,7 @@ static void test_transfer_forces_have_no_sum_and_no_moment(void **state) {
         sim->kernels->p2g(&span, &result);
         double sum[3] = {0}, virial[9] = {0}, spin[3] = {0}, size = 0;
         FOR_NODES(&sim->grid, i) {
-            const double *mv = sim->grid.node + i * MPM_NODE + 1, *f = mv + dim;
+            const double *mv = sim->grid.node + i * MPM_NODE + 1, *f = mv - 1 + MPM_NODE_FORCE;
             double x[3] = {0}, v[3] = {0};
             node_position(&sim->grid, i, x);
             for (int d = 0; d < dim; d++) {

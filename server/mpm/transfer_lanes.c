@@ -1,0 +1,1096 @@
+// Particle-grid transfers in lanes: what server/mpm/transfer.c does, many particles at a time. The
+// file is compiled once for each instruction set, with MPM_LANES and MPM_LANES_NAME.
+//
+// A tile is worked on in batches that stay in the first-level cache, in four stages (docs/design.md
+// has the picture):
+//
+//   weights   particles in lanes: base functions of each particle along each direction, and its
+//             cell; then runs of particles of one cell
+//   gather    particles in lanes, the values of one node at a time for all of them
+//   update    particles in lanes: eqs. 11-17, the material's law, and the records of what the
+//             particle gives to its nodes, one particle after another
+//   scatter   the components of a node in lanes: a run's sums for one node after another stay in
+//             registers and are added to the grid once a run
+//
+// Arithmetic differs from the plain kernels' in the order of sums only.
+#include "server/mpm/transfer.h"
+
+#include <string.h>
+
+#include "server/mpm/basis.h"
+#include "server/mpm/kernels.h"
+#include "server/mpm/laws.h"
+
+#if MPM_LANES == 1
+#error "the plain kernels are server/mpm/transfer.c"
+#endif
+
+#define BATCH 64                 // particles
+#define ROOM (BATCH + MPM_LANES) // the last vector of a run may reach past the batch
+#define PARTS (8 / MPM_LANES)    // vectors of one node's eight components
+#define UNROLL _Pragma("GCC unroll 8")
+
+// What a particle gives to its nodes, in the node's order of components (m, mv, f, V):
+//   2D: m mv_x mv_y V | -V/h (s_xx s_xy) -V/h (s_xy s_yy)
+//   3D: m mv (3) | -V/h (s_xx s_xy s_xz) V, then -V/h (s_xz s_yz s_zz) 0 | -V/h (s_xy s_yy s_yz) 0
+// so that the force of each direction of the gradient is found, within its half, where the node
+// keeps its force.
+
+struct extent {
+    size_t first;   // particle of lane 0, a multiple of MPM_BLOCK
+    int begin, end; // lanes that belong to the span
+};
+
+struct batch {
+    struct extent in;
+    int n_runs, run[BATCH + 1]; // first lane of each run, and the end of the last
+    uint32_t key[BATCH];        // by run
+    MPM_ALIGNED double t[MPM_MAX_DIM][ROOM]; // place in the cell, that the weights follow from
+    MPM_ALIGNED double w[MPM_MAX_DIM][MPM_MAX_SUPPORT][ROOM], dw[MPM_MAX_DIM][MPM_MAX_SUPPORT][ROOM];
+    MPM_ALIGNED double v[MPM_MAX_DIM][ROOM], dv[MPM_MAX_DIM][ROOM], l[9][ROOM]; // gathered
+    MPM_ALIGNED double ratio[2][ROOM]; // F-bar's averages, or what goes into them
+    MPM_ALIGNED double row[ROOM][4];   // weights along the last direction, particle by particle
+    MPM_ALIGNED double record[BATCH][16];
+};
+
+// Stages take what they read of a batch's extent, of the particles' and of the grid's description as
+// local copies: vectors may alias anything, so after each store the compiler would read all of it
+// again from where others can see it.
+
+// The vector of lanes at `lane` of one component of a field in blocks.
+MPM_KERNEL double *at(double *field, struct extent in, int lane, int n_components, int c) {
+    return field + mpm_at(in.first + (size_t)lane, n_components, c);
+}
+// Where a batch ends within a vector, lanes of the same cache lines may belong to another thread's
+// tile, or to no particle: these are neither read nor written. Elsewhere vectors are moved whole:
+// that is faster, and what a masked store has written reaches later loads only through the cache.
+MPM_KERNEL mpm_vec get(struct extent in, int lane, const double *from, double other,
+                       const bool whole) {
+    return whole ? mpm_load_aligned(from)
+                 : mpm_load_lanes_or(from, in.begin - lane, in.end - lane, other);
+}
+MPM_KERNEL void put(struct extent in, int lane, double *to, mpm_vec a, const bool whole) {
+    if (whole) {
+        mpm_store_aligned(to, a);
+    } else {
+        mpm_store_lanes(to, a, in.begin - lane, in.end - lane);
+    }
+}
+// One loop over a batch's vectors, of which the body knows whether they are whole.
+#define FOR_VECTORS(in, body)                                                                      \
+    for (int lane = 0; lane < (in).end; lane += MPM_LANES) {                                       \
+        if (MPM_UNLIKELY(lane < (in).begin || lane + MPM_LANES > (in).end)) {                      \
+            body(false);                                                                           \
+        } else {                                                                                   \
+            body(true);                                                                            \
+        }                                                                                          \
+    }
+
+// ---- Weights ----
+
+// Runs begin where the cell is not the one before.
+MPM_KERNEL void find_runs(struct batch *b, const int32_t *key) {
+    const struct extent in = b->in;
+    uint64_t begins = mpm_changes_64(key);
+    begins = (begins | (uint64_t)1 << in.begin) & UINT64_MAX << in.begin;
+    begins &= UINT64_MAX >> (BATCH - in.end);
+    int n = 0;
+    for (; begins; begins &= begins - 1) {
+        b->run[n++] = __builtin_ctzll(begins);
+    }
+    for (int r = 0; r < n; r++) {
+        b->key[r] = (uint32_t)key[b->run[r]];
+    }
+    b->n_runs = n;
+    b->run[n] = in.end;
+}
+
+// Cells, runs, and places in the cells.
+MPM_KERNEL void find_cells(struct batch *b, const struct mpm_span *span, const int dim,
+                           const enum mpm_basis basis) {
+    const struct mpm_particles part = *span->s, *s = &part;
+    const struct mpm_grid grid = *span->grid, *g = &grid;
+    const struct extent in = b->in;
+    int32_t keys[1 + ROOM], *const key = keys + 1; // one before, which find_runs compares with
+    keys[0] = -1;
+    for (int lane = 0; lane < in.end; lane += MPM_LANES) {
+        mpm_vec block = mpm_splat(0), cell = mpm_splat(0);
+        UNROLL for (int d = 0; d < dim; d++) {
+            // Lanes of other tiles are read, too: no pass that has them writes positions.
+            const mpm_vec x = mpm_load_aligned(at(s->x, in, lane, dim, d));
+            const mpm_vec xi = (x - g->origin[d]) * g->inv_h;
+            const mpm_vec base = mpm_base(basis, xi, s->half);
+            const mpm_vec of = mpm_floor(base * (1.0 / MPM_EDGE));
+            block = d == 0 ? of : block * (double)g->n_blocks[d] + of;
+            const mpm_vec in = base - of * (double)MPM_EDGE;
+            cell = d == 0 ? in : cell * (double)MPM_EDGE + in;
+            mpm_store_aligned(&b->t[d][lane], xi - base);
+        }
+        mpm_store_int32(&key[lane], block * (double)MPM_BLOCK_NODES(dim) + cell);
+    }
+    find_runs(b, key);
+}
+
+// The weights of all particles, for the stages that take one particle after another.
+MPM_KERNEL void write_weights(struct batch *b, const struct mpm_particles *s, const int dim,
+                              const enum mpm_basis basis, const bool gradients) {
+    const double half = s->half, inv_4_half = s->inv_4_half;
+    const struct extent in = b->in;
+    const int support = mpm_support(basis);
+    for (int lane = 0; lane < in.end; lane += MPM_LANES) {
+        UNROLL for (int d = 0; d < dim; d++) {
+            mpm_vec w[MPM_MAX_SUPPORT], dw[MPM_MAX_SUPPORT];
+            mpm_weights_at(basis, mpm_load_aligned(&b->t[d][lane]), half, inv_4_half, w, dw);
+            UNROLL for (int a = 0; a < support; a++) {
+                mpm_store_aligned(&b->w[d][a][lane], w[a]);
+                if (gradients) {
+                    mpm_store_aligned(&b->dw[d][a][lane], dw[a]);
+                }
+            }
+        }
+    }
+}
+
+// Weights along the last direction, particle by particle, for sums whose nodes lie in lanes.
+MPM_KERNEL void find_rows(struct batch *b, const int dim, const enum mpm_basis basis) {
+    const struct extent in = b->in;
+    for (int lane = 0; lane < in.end; lane += 4) {
+        mpm_transpose_4(b->w[dim - 1][0] + lane, b->w[dim - 1][1] + lane,
+                        mpm_support(basis) > 2 ? b->w[dim - 1][2] + lane : NULL,
+                        mpm_support(basis) > 3 ? b->w[dim - 1][3] + lane : NULL, b->row[lane]);
+    }
+}
+
+// mpm_grid_stencil from the grid's table, many nodes at a time.
+MPM_KERNEL void find_nodes(uint32_t *nodes, const struct mpm_grid *g, uint32_t key, const int dim,
+                           const int support) {
+    const int n = dim == 2 ? support * support : support * support * support;
+    const size_t cell = key & (uint32_t)(MPM_BLOCK_NODES(dim) - 1);
+    const uint32_t *near = g->near[g->slot[key >> MPM_BLOCK_BITS(dim)]];
+    const uint8_t *which = g->which + cell * MPM_MAX_STENCIL, *place = g->place + cell * MPM_MAX_STENCIL;
+    UNROLL for (int k = 0; k < n; k += 8) {
+        mpm_pick_8(near, which + k, place + k, nodes + k);
+    }
+}
+
+// ---- Gather ----
+
+// The value of one component at a node, for lanes of two cells: of the first cell's node, but of the
+// second's where `second`.
+MPM_KERNEL mpm_vec node_value(const double *one, const double *other, mpm_mask second,
+                              const bool two) {
+    return two ? mpm_select(second, mpm_splat(*other), mpm_splat(*one)) : mpm_splat(*one);
+}
+
+// eqs. 11, 12, 16: v^{n+1}, its increment and its gradient (per cell) at the particles of one
+// vector, whose cells' nodes are given: of one cell, or of two.
+MPM_KERNEL void gather_velocity_at(const struct batch *b, int lane,
+                                   const struct mpm_particles *s, const double *velocity,
+                                   const uint32_t *nodes, const uint32_t *others, mpm_mask second,
+                                   const bool two, mpm_vec *out, const int dim,
+                                   const enum mpm_basis basis) {
+    const int support = mpm_support(basis), last = dim - 1, planes = dim == 3 ? support : 1;
+    mpm_vec *v = out, *dv = out + dim, *l = out + 2 * dim;
+    mpm_vec w[MPM_MAX_DIM][MPM_MAX_SUPPORT], dw[MPM_MAX_DIM][MPM_MAX_SUPPORT];
+    UNROLL for (int d = 0; d < dim; d++) {
+        mpm_weights_at(basis, mpm_load_aligned(&b->t[d][lane]), s->half, s->inv_4_half, w[d], dw[d]);
+    }
+    const mpm_vec *w_last = w[last], *dw_last = dw[last];
+    UNROLL for (int a = 0; a < support; a++) {
+        const mpm_vec wa = w[0][a], dwa = dw[0][a];
+        UNROLL for (int p = 0; p < planes; p++) {
+            const int row = (dim == 3 ? a * support + p : a) * support;
+            mpm_vec v_w[3], v_dw[3], dv_w[3]; // sums along the row
+            UNROLL for (int c = 0; c < support; c++) {
+                const double *one = velocity + (size_t)nodes[row + c] * MPM_VELOCITY(dim);
+                const double *other =
+                    two ? velocity + (size_t)others[row + c] * MPM_VELOCITY(dim) : one;
+                UNROLL for (int d = 0; d < dim; d++) {
+                    const mpm_vec of = node_value(one + d, other + d, second, two);
+                    v_w[d] = c == 0 ? w_last[c] * of : v_w[d] + w_last[c] * of;
+                    v_dw[d] = c == 0 ? dw_last[c] * of : v_dw[d] + dw_last[c] * of;
+                    const mpm_vec change = node_value(one + dim + d, other + dim + d, second, two);
+                    dv_w[d] = c == 0 ? w_last[c] * change : dv_w[d] + w_last[c] * change;
+                }
+            }
+            mpm_vec w_row = wa, dw_row[2] = {dwa, dwa};
+            if (dim == 3) {
+                w_row = wa * w[1][p];
+                dw_row[0] = dwa * w[1][p];
+                dw_row[1] = wa * dw[1][p];
+            }
+            const bool first = a == 0 && p == 0;
+            UNROLL for (int d = 0; d < dim; d++) {
+                v[d] = first ? w_row * v_w[d] : v[d] + w_row * v_w[d];
+                dv[d] = first ? w_row * dv_w[d] : dv[d] + w_row * dv_w[d];
+                mpm_vec *to = &l[d * dim];
+                to[last] = first ? w_row * v_dw[d] : to[last] + w_row * v_dw[d];
+                UNROLL for (int e = 0; e < last; e++) {
+                    to[e] = first ? dw_row[e] * v_w[d] : to[e] + dw_row[e] * v_w[d];
+                }
+            }
+        }
+    }
+}
+
+// eq. 20: the averages at the particles of one vector.
+MPM_KERNEL void gather_ratios_at(const struct batch *b, int lane, const struct mpm_particles *s,
+                                 const double *fbar,
+                                 const uint32_t *nodes, const uint32_t *others, mpm_mask second,
+                                 const bool two, mpm_vec *sum, const int dim,
+                                 const enum mpm_basis basis, const int scalars) {
+    const int support = mpm_support(basis), last = dim - 1, planes = dim == 3 ? support : 1;
+    mpm_vec w[MPM_MAX_DIM][MPM_MAX_SUPPORT], dw[MPM_MAX_SUPPORT];
+    UNROLL for (int d = 0; d < dim; d++) {
+        mpm_weights_at(basis, mpm_load_aligned(&b->t[d][lane]), s->half, s->inv_4_half, w[d], dw);
+    }
+    const mpm_vec *w_last = w[last];
+    UNROLL for (int a = 0; a < support; a++) {
+        const mpm_vec wa = w[0][a];
+        UNROLL for (int p = 0; p < planes; p++) {
+            const int row = (dim == 3 ? a * support + p : a) * support;
+            const mpm_vec w_row = dim == 3 ? wa * w[1][p] : wa;
+            UNROLL for (int k = 0; k < scalars; k++) {
+                mpm_vec along;
+                UNROLL for (int c = 0; c < support; c++) {
+                    const double *one = fbar + (size_t)nodes[row + c] * (size_t)scalars + k;
+                    const double *other =
+                        two ? fbar + (size_t)others[row + c] * (size_t)scalars + k : one;
+                    const mpm_vec of = node_value(one, other, second, two);
+                    along = c == 0 ? w_last[c] * of : along + w_last[c] * of;
+                }
+                sum[k] = a == 0 && p == 0 ? w_row * along : sum[k] + w_row * along;
+            }
+        }
+    }
+}
+
+// What is gathered: velocities (scalars = 0), or F-bar's averages.
+MPM_KERNEL void gather_at(const struct batch *b, int lane, const struct mpm_particles *s,
+                          const struct mpm_grid *g, const uint32_t *nodes, const uint32_t *others, mpm_mask second,
+                          const bool two, mpm_vec *out, const int dim, const enum mpm_basis basis,
+                          const int scalars) {
+    if (scalars == 0) {
+        gather_velocity_at(b, lane, s, g->velocity, nodes, others, second, two, out, dim, basis);
+    } else {
+        gather_ratios_at(b, lane, s, g->fbar, nodes, others, second, two, out, dim, basis, scalars);
+    }
+}
+
+// A vector mostly has particles of one cell or of two, seldom of more.
+MPM_KERNEL void gather(struct batch *b, const struct mpm_span *span, const int dim,
+                       const enum mpm_basis basis, const int scalars) {
+    const struct extent in = b->in;
+    const struct mpm_particles part = *span->s, *s = &part;
+    const struct mpm_grid grid = *span->grid, *g = &grid;
+    const int support = mpm_support(basis), n = scalars == 0 ? 2 * dim + dim * dim : scalars;
+    uint32_t stencil[2][MPM_STENCIL_ROOM], *nodes = stencil[0], *others = stencil[1];
+    int run = 0;
+    find_nodes(nodes, g, b->key[0], dim, support);
+    for (int lane = in.begin / MPM_LANES * MPM_LANES; lane < in.end; lane += MPM_LANES) {
+        // `nodes` are those of the run that the vector begins in.
+        mpm_vec out[6 + 9];
+        if (b->run[run + 1] >= lane + MPM_LANES || run + 1 == b->n_runs) {
+            gather_at(b, lane, s, g, nodes, nodes, mpm_from_lane(MPM_LANES), false, out, dim, basis, scalars);
+        } else {
+            find_nodes(others, g, b->key[run + 1], dim, support);
+            mpm_mask second = mpm_from_lane(b->run[run + 1] - lane);
+            gather_at(b, lane, s, g, nodes, others, second, true, out, dim, basis, scalars);
+            uint32_t *swap = nodes;
+            nodes = others;
+            others = swap;
+            for (run++; run + 1 < b->n_runs && b->run[run + 1] < lane + MPM_LANES; run++) {
+                mpm_vec more[6 + 9];
+                find_nodes(nodes, g, b->key[run + 1], dim, support);
+                second = mpm_from_lane(b->run[run + 1] - lane);
+                gather_at(b, lane, s, g, nodes, nodes, second, false, more, dim, basis, scalars);
+                for (int k = 0; k < n; k++) {
+                    out[k] = mpm_select(second, more[k], out[k]);
+                }
+            }
+        }
+        if (run + 1 < b->n_runs && b->run[run + 1] == lane + MPM_LANES) {
+            run++;
+            find_nodes(nodes, g, b->key[run], dim, support);
+        }
+        if (scalars > 0) {
+            UNROLL for (int k = 0; k < scalars; k++) {
+                mpm_store_aligned(&b->ratio[k][lane], out[k]);
+            }
+            continue;
+        }
+        UNROLL for (int d = 0; d < dim; d++) {
+            mpm_store_aligned(&b->v[d][lane], out[d]);
+            mpm_store_aligned(&b->dv[d][lane], out[dim + d]);
+            UNROLL for (int e = 0; e < dim; e++) {
+                mpm_store_aligned(&b->l[d * dim + e][lane], out[2 * dim + d * dim + e]);
+            }
+        }
+    }
+}
+
+// ---- Scatter ----
+
+// eqs. 7, 8, 10: mass, momentum, force and volume of the records to the nodes. In 3D one plane of
+// nodes at a time stays in registers, those of one place along the first direction.
+MPM_KERNEL void scatter_part(const struct batch *b, double *node, const uint32_t *nodes, int begin,
+                             int end, const int part, const enum mpm_basis basis) {
+    const int support = mpm_support(basis), at = part * MPM_LANES;
+    const bool has_force = MPM_LANES == 8 || part == 1;
+    for (int plane = 0; plane < support; plane++) {
+        mpm_vec sum[MPM_MAX_SUPPORT][MPM_MAX_SUPPORT];
+        UNROLL for (int i = 0; i < support; i++) {
+            UNROLL for (int c = 0; c < support; c++) {
+                sum[i][c] = mpm_splat(0);
+            }
+        }
+        for (int p = begin; p < end; p++) {
+            const mpm_vec own = mpm_load_aligned(b->record[p] + at);
+            const mpm_vec w0 = mpm_splat(b->w[0][plane][p]);
+            mpm_vec Q = mpm_keep(own, mpm_sums(part)) * w0, Y, Z;
+            if (has_force) {
+                const mpm_word force = mpm_forces(part);
+                Q += mpm_keep(own, force) * mpm_splat(b->dw[0][plane][p]);
+                Y = mpm_keep(mpm_load_aligned(b->record[p] + 8 + at), force) * w0;
+                Z = mpm_keep(mpm_load_upper(b->record[p] + 8), force) * w0;
+            }
+            UNROLL for (int i = 0; i < support; i++) {
+                const mpm_vec w1 = mpm_splat(b->w[1][i][p]);
+                mpm_vec R = Q * w1, S;
+                if (has_force) {
+                    R += Y * mpm_splat(b->dw[1][i][p]);
+                    S = Z * w1;
+                }
+                UNROLL for (int c = 0; c < support; c++) {
+                    sum[i][c] += R * mpm_splat(b->w[2][c][p]);
+                    if (has_force) {
+                        sum[i][c] += S * mpm_splat(b->dw[2][c][p]);
+                    }
+                }
+            }
+        }
+        UNROLL for (int i = 0; i < support; i++) {
+            UNROLL for (int c = 0; c < support; c++) {
+                double *to =
+                    node + (size_t)nodes[(plane * support + i) * support + c] * MPM_NODE + at;
+                mpm_store_aligned(to, mpm_load_aligned(to) + sum[i][c]);
+            }
+        }
+    }
+}
+
+// The same in 2D, where the records have room for both directions of the gradient side by side, so
+// that a node takes one multiplication: the sums of both meet when the run is over.
+MPM_KERNEL void scatter_part_2d(const struct batch *b, double *node, const uint32_t *nodes,
+                                int begin, int end, const int part, const enum mpm_basis basis) {
+    const int support = mpm_support(basis), at = part * MPM_LANES;
+    mpm_vec sum[MPM_MAX_SUPPORT][MPM_MAX_SUPPORT];
+    UNROLL for (int i = 0; i < support; i++) {
+        UNROLL for (int c = 0; c < support; c++) {
+            sum[i][c] = mpm_splat(0);
+        }
+    }
+    for (int p = begin; p < end; p++) {
+        const mpm_vec own = mpm_load_aligned(b->record[p] + at);
+        mpm_vec R[MPM_MAX_SUPPORT], B[MPM_MAX_SUPPORT];
+        UNROLL for (int i = 0; i < support; i++) {
+            R[i] = own * mpm_splat_two(b->w[0][i] + p, b->dw[0][i] + p, 4, part);
+            B[i] = mpm_splat_two(b->w[1][i] + p, b->dw[1][i] + p, 6, part);
+        }
+        UNROLL for (int i = 0; i < support; i++) {
+            UNROLL for (int c = 0; c < support; c++) {
+                sum[i][c] += R[i] * B[c];
+            }
+        }
+    }
+    UNROLL for (int i = 0; i < support; i++) {
+        UNROLL for (int c = 0; c < support; c++) {
+            double *to = node + (size_t)nodes[i * support + c] * MPM_NODE + at;
+            mpm_store_aligned(to, mpm_load_aligned(to) + mpm_join_pairs(sum[i][c], part));
+        }
+    }
+}
+
+MPM_KERNEL void scatter_records(const struct batch *b, const struct mpm_grid *g, const int dim,
+                                const enum mpm_basis basis) {
+    for (int r = 0; r < b->n_runs; r++) {
+        uint32_t nodes[MPM_STENCIL_ROOM];
+        find_nodes(nodes, g, b->key[r], dim, mpm_support(basis));
+        UNROLL for (int part = 0; part < PARTS; part++) {
+            if (dim == 2) {
+                scatter_part_2d(b, g->node, nodes, b->run[r], b->run[r + 1], part, basis);
+            } else {
+                scatter_part(b, g->node, nodes, b->run[r], b->run[r + 1], part, basis);
+            }
+        }
+    }
+}
+
+// eq. 19: what F-bar averages, b->ratio, to the nodes; the nodes of a row lie in lanes.
+MPM_KERNEL void scatter_ratios(struct batch *b, const struct mpm_grid *g, const int dim,
+                               const enum mpm_basis basis, const int scalars) {
+    const int support = mpm_support(basis), planes = dim == 3 ? support : 1;
+    for (int r = 0; r < b->n_runs; r++) {
+        uint32_t nodes[MPM_STENCIL_ROOM];
+        find_nodes(nodes, g, b->key[r], dim, support);
+        const int begin = b->run[r], end = b->run[r + 1];
+        for (int k = 0; k < scalars; k++) {
+            mpm_four sum[MPM_MAX_SUPPORT][MPM_MAX_SUPPORT];
+            UNROLL for (int a = 0; a < support; a++) {
+                UNROLL for (int i = 0; i < planes; i++) {
+                    sum[a][i] = (mpm_four){0};
+                }
+            }
+            for (int p = begin; p < end; p++) {
+                const mpm_four of = mpm_load_four(b->row[p]) * b->ratio[k][p];
+                UNROLL for (int a = 0; a < support; a++) {
+                    const double wa = b->w[0][a][p];
+                    if (dim == 2) {
+                        sum[a][0] += of * wa;
+                        continue;
+                    }
+                    const mpm_four plane = of * wa;
+                    UNROLL for (int i = 0; i < support; i++) {
+                        sum[a][i] += plane * b->w[1][i][p];
+                    }
+                }
+            }
+            const uint32_t *row = nodes;
+            UNROLL for (int a = 0; a < support; a++) {
+                UNROLL for (int i = 0; i < planes; i++, row += support) {
+                    UNROLL for (int c = 0; c < support; c++) {
+                        g->fbar[(size_t)row[c] * (size_t)scalars + (size_t)k] += sum[a][i][c];
+                    }
+                }
+            }
+        }
+    }
+}
+
+// ---- Update ----
+
+// What the lanes of a tile find, until it is over.
+struct found {
+    mpm_vec min[MPM_MAX_DIM], max[MPM_MAX_DIM], v2_max, dx_max, mass_dx[MPM_MAX_DIM];
+};
+
+MPM_KERNEL void found_nothing(struct found *f) {
+    for (int d = 0; d < MPM_MAX_DIM; d++) {
+        f->min[d] = mpm_splat(INFINITY);
+        f->max[d] = mpm_splat(-INFINITY);
+        f->mass_dx[d] = mpm_splat(0);
+    }
+    f->v2_max = f->dx_max = mpm_splat(0);
+}
+
+MPM_KERNEL void found_all(const struct found *f, struct mpm_span_result *r, const int dim) {
+    for (int d = 0; d < dim; d++) {
+        r->min[d] = mpm_hmin(f->min[d]);
+        r->max[d] = mpm_hmax(f->max[d]);
+        r->mass_dx[d] = mpm_hsum(f->mass_dx[d]);
+    }
+    r->v2_max = mpm_hmax(f->v2_max);
+    r->dx_max = mpm_hmax(f->dx_max);
+}
+
+// The first lane at fault is the tile's, unless there was one before.
+__attribute__((cold, noinline)) static void fault(struct mpm_span_result *r, struct extent in,
+                                                  int lane, unsigned lanes, enum mpm_status status,
+                                                  const double *value) {
+    for (int i = 0; i < MPM_LANES && r->bad == SIZE_MAX; i++) {
+        if (lanes >> i & 1 && lane + i >= in.begin && lane + i < in.end) {
+            r->bad = in.first + (size_t)(lane + i);
+            r->status = status;
+            r->value = value[i];
+        }
+    }
+}
+MPM_KERNEL void fault_unless(mpm_mask good, struct mpm_span_result *r, struct extent in, int lane,
+                             enum mpm_status status, mpm_vec value) {
+    if (MPM_UNLIKELY(!mpm_all(good))) {
+        double values[MPM_LANES];
+        mpm_store(values, value);
+        fault(r, in, lane, ~mpm_bits(good), status, values);
+    }
+}
+
+#define EACH_KEEPS_F_KEEPS_F(text) text
+#define EACH_KEEPS_F_KEEPS_B(text)
+#define EACH_KEEPS_F_KEEPS_J(text)
+#define EACH_KEEPS_B_KEEPS_F(text)
+#define EACH_KEEPS_B_KEEPS_B(text) text
+#define EACH_KEEPS_B_KEEPS_J(text)
+#define EACH_KEEPS_J_KEEPS_F(text)
+#define EACH_KEEPS_J_KEEPS_B(text)
+#define EACH_KEEPS_J_KEEPS_J(text) text
+
+MPM_KERNEL enum mpm_kinematics kept_by(const enum mpm_law law) {
+    switch (law) {
+#define X(name, keeps)                                                                             \
+    case MPM_LAW_##name:                                                                           \
+        return MPM_##keeps;
+        MPM_LAWS(X)
+#undef X
+    default:
+        return MPM_KEEPS_F;
+    }
+}
+
+// The stress of what is kept: F (dim x dim), b (MPM_SYM) or J (1), to which a fluid's rate part in
+// sigma is added.
+MPM_KERNEL void stress(const enum mpm_law law, const void *constants, mpm_vec *kept, mpm_vec *a,
+                       mpm_vec *sigma, const int dim) {
+    switch (law) {
+#define X(name, keeps)                                                                             \
+    case MPM_LAW_##name:                                                                           \
+        EACH_KEEPS_F_##keeps(name##_stress(constants, kept, sigma, dim);)                          \
+            EACH_KEEPS_B_##keeps(name##_stress(constants, kept, a, sigma, dim);)                   \
+                EACH_KEEPS_J_##keeps(name##_stress(constants, kept[0], sigma, dim);) break;
+        MPM_LAWS(X)
+#undef X
+    default:
+        break;
+    }
+    (void)a;
+}
+
+MPM_KERNEL void rate_stress(const enum mpm_law law, const void *constants, const mpm_vec *L,
+                            mpm_vec *sigma, const int dim) {
+    switch (law) {
+#define X(name, keeps)                                                                             \
+    case MPM_LAW_##name:                                                                           \
+        EACH_KEEPS_J_##keeps(name##_rate(constants, L, sigma, dim);) break;
+        MPM_LAWS(X)
+#undef X
+    default:
+        break;
+    }
+}
+
+MPM_KERNEL int n_kept(const enum mpm_kinematics kinematics, const int dim) {
+    return kinematics == MPM_KEEPS_F ? dim * dim : kinematics == MPM_KEEPS_B ? MPM_SYM(dim) : 1;
+}
+MPM_KERNEL double *field_kept(const struct mpm_particles *s, const enum mpm_kinematics kinematics) {
+    return kinematics == MPM_KEEPS_F ? s->F : kinematics == MPM_KEEPS_B ? s->b : s->Jbar;
+}
+MPM_KERNEL void load_kept(const struct mpm_particles *s, struct extent in, int lane,
+                          mpm_vec *kept, const int dim, const enum mpm_kinematics kinematics,
+                          const bool whole) {
+    const int n = n_kept(kinematics, dim);
+    UNROLL for (int k = 0; k < n; k++) { // the undeformed state where lanes are not the batch's
+        const bool one = kinematics == MPM_KEEPS_F ? k % (dim + 1) == 0 : k < 3;
+        kept[k] = get(in, lane, at(field_kept(s, kinematics), in, lane, n, k), one, whole);
+    }
+}
+MPM_KERNEL void store_kept(const struct mpm_particles *s, struct extent in, int lane,
+                           const mpm_vec *kept, const int dim, const enum mpm_kinematics kinematics,
+                           const bool whole) {
+    const int n = n_kept(kinematics, dim);
+    UNROLL for (int k = 0; k < n; k++) {
+        put(in, lane, at(field_kept(s, kinematics), in, lane, n, k), kept[k], whole);
+    }
+}
+
+// eq. 14 with dF = 1 + D, on what the material keeps.
+MPM_KERNEL void deform(mpm_vec *kept, const mpm_vec *D, mpm_vec dJ_minus_one, const int dim,
+                       const enum mpm_kinematics kinematics) {
+    if (kinematics == MPM_KEEPS_J) {
+        kept[0] += kept[0] * dJ_minus_one;
+        return;
+    }
+    mpm_vec A[9], DA[9]; // F, or b in full
+    UNROLL for (int i = 0; i < dim; i++) {
+        UNROLL for (int j = 0; j < dim; j++) {
+            A[i * dim + j] = kept[kinematics == MPM_KEEPS_F ? i * dim + j : mpm_sym_index(i, j)];
+        }
+    }
+    UNROLL for (int i = 0; i < dim; i++) {
+        UNROLL for (int j = 0; j < dim; j++) {
+            DA[i * dim + j] = D[i * dim] * A[j];
+            UNROLL for (int k = 1; k < dim; k++) {
+                DA[i * dim + j] += D[i * dim + k] * A[k * dim + j];
+            }
+        }
+    }
+    if (kinematics == MPM_KEEPS_F) {
+        UNROLL for (int k = 0; k < dim * dim; k++) {
+            kept[k] = A[k] + DA[k];
+        }
+        return;
+    }
+    UNROLL for (int i = 0; i < dim; i++) { // dF b dF^T = b + D b + (D b)^T + D b D^T
+        UNROLL for (int j = i; j < dim; j++) {
+            mpm_vec change = DA[i * dim + j] + DA[j * dim + i];
+            UNROLL for (int k = 0; k < dim; k++) {
+                change += DA[i * dim + k] * D[j * dim + k];
+            }
+            kept[mpm_sym_index(i, j)] += change;
+        }
+    }
+}
+
+MPM_KERNEL mpm_vec ratio_of(const mpm_vec *kept, const int dim,
+                            const enum mpm_kinematics kinematics) {
+    return kinematics == MPM_KEEPS_F   ? mpm_det(kept, dim)
+           : kinematics == MPM_KEEPS_B ? mpm_sqrt(mpm_det_sym(kept, dim))
+                                       : kept[0];
+}
+
+// What a step does to particles.
+struct by {
+    double dt, blend, inv_h, a, C;
+};
+MPM_KERNEL struct by what_by(const struct mpm_span *span) {
+    return (struct by){.dt = span->dt,
+                       .blend = span->blend,
+                       .inv_h = span->grid->inv_h,
+                       .a = span->a,
+                       .C = span->C};
+}
+
+// The stages of an update are short loops over the vectors of a batch, so that the processor has
+// several vectors of each in work at a time: every one is a long chain of dependent operations.
+
+MPM_KERNEL void update_velocity(struct batch *b, struct extent in, int lane,
+    const struct mpm_particles *s, const struct by *by,
+                                struct mpm_span_result *r, mpm_vec *v2_max, const int dim,
+                                const bool keeps_step, const bool whole) {
+    mpm_vec v2 = mpm_splat(0);
+    UNROLL for (int d = 0; d < dim; d++) { // eqs. 11-13
+        const mpm_vec v_pic = get(in, lane, &b->v[d][lane], 0, whole);
+        const mpm_vec dv = get(in, lane, &b->dv[d][lane], 0, whole);
+        double *to = at(s->v, in, lane, dim, d);
+        const mpm_vec flip = get(in, lane, to, 0, whole) + dv;
+        const mpm_vec v = v_pic + by->blend * (flip - v_pic);
+        put(in, lane, to, v, whole);
+        v2 += v * v;
+        const mpm_vec dx = by->dt * v_pic;
+        mpm_store_aligned(&b->v[d][lane], dx); // from here on the step
+        if (keeps_step) {
+            put(in, lane, at(s->dx, in, lane, dim, d), dx, whole);
+        }
+    }
+    fault_unless(v2 < INFINITY, r, in, lane, MPM_ERR_NOT_FINITE, v2);
+    *v2_max = mpm_max(v2, *v2_max);
+}
+
+// Deformation and, without F-bar, volume; else what will be averaged.
+MPM_KERNEL void update_deformation(struct batch *b, struct extent in, int lane,
+    const struct mpm_particles *s, const struct by *by,
+                                   struct mpm_span_result *r, const int dim,
+                                   const enum mpm_law law, const enum mpm_fbar_scheme scheme,
+                                   const bool whole) {
+    const enum mpm_kinematics kinematics = kept_by(law);
+    const int n_sym = MPM_SYM(dim);
+    const double inv_h = by->inv_h, dt_over_h = by->dt * inv_h;
+    mpm_vec D[9], kept[9], sigma[6];
+    UNROLL for (int k = 0; k < dim * dim; k++) { // the relative deformation gradient less 1
+        D[k] = get(in, lane, &b->l[k][lane], 0, whole) * dt_over_h;
+    }
+    const mpm_vec dJ_minus_one = mpm_det_minus_one(D, dim);
+    load_kept(s, in, lane, kept, dim, kinematics, whole);
+    deform(kept, D, dJ_minus_one, dim, kinematics);
+    store_kept(s, in, lane, kept, dim, kinematics, whole);
+    const mpm_vec ratio = ratio_of(kept, dim, kinematics);
+    double *to_V = at(s->V, in, lane, 1, 0);
+    mpm_vec V = get(in, lane, to_V, 1, whole);
+    if (kinematics == MPM_KEEPS_J) {
+        if (s->J_raw) {
+            double *to = at(s->J_raw, in, lane, 1, 0);
+            const mpm_vec J = get(in, lane, to, 0, whole);
+            put(in, lane, to, J + J * dJ_minus_one, whole);
+        }
+        mpm_vec L[9];
+        UNROLL for (int k = 0; k < dim * dim; k++) {
+            L[k] = get(in, lane, &b->l[k][lane], 0, whole) * inv_h;
+        }
+        rate_stress(law, s->constants, L, sigma, dim);
+        UNROLL for (int k = 0; k < n_sym; k++) {
+            put(in, lane, at(s->sigma, in, lane, n_sym, k), sigma[k], whole);
+        }
+    }
+    if (scheme == MPM_FBAR_OFF) {
+        V += V * dJ_minus_one; // eq. 15
+        put(in, lane, to_V, V, whole);
+        fault_unless(ratio > 0.0, r, in, lane, MPM_ERR_VOLUME, ratio);
+        fault_unless(V > 0.0, r, in, lane, MPM_ERR_VOLUME, V);
+        return;
+    }
+    const mpm_vec dJ = 1.0 + dJ_minus_one;
+    put(in, lane, at(s->dJ, in, lane, 1, 0), dJ, whole);
+    if (kinematics == MPM_KEEPS_B) { // sqrt(det b) would not tell
+        fault_unless(dJ > 0.0, r, in, lane, MPM_ERR_VOLUME, dJ);
+    }
+    // Algorithm 1, step 3; the trial ratio Jbar^n dJ is the ratio in use.
+    if (scheme == MPM_FBAR_ZHAO) {
+        mpm_store_aligned(&b->ratio[0][lane], V * ratio);
+    } else {
+        const mpm_vec A = V * dJ, H = V / get(in, lane, at(s->V0, in, lane, 1, 0), 1, whole);
+        mpm_store_aligned(&b->ratio[0][lane], A);
+        mpm_store_aligned(&b->ratio[1][lane], (1 - by->a) * V * ratio + by->a * A * H);
+    }
+}
+
+// Algorithm 1, step 4, from the averages that were gathered, applied to the trial deformation
+// instead of to dF; and the volume.
+MPM_KERNEL void rescale(struct batch *b, struct extent in, int lane,
+    const struct mpm_particles *s, const struct by *by,
+                        struct mpm_span_result *r, const int dim, const enum mpm_law law,
+                        const enum mpm_fbar_scheme scheme, const bool whole) {
+    const enum mpm_kinematics kinematics = kept_by(law);
+    mpm_vec kept[9], dx2 = mpm_splat(0);
+    load_kept(s, in, lane, kept, dim, kinematics, whole);
+    UNROLL for (int d = 0; d < dim; d++) {
+        const mpm_vec dx = get(in, lane, at(s->dx, in, lane, dim, d), 0, whole);
+        mpm_store_aligned(&b->v[d][lane], dx);
+        dx2 += dx * dx;
+    }
+    const mpm_vec trial = ratio_of(kept, dim, kinematics);
+    const mpm_vec A = get(in, lane, &b->ratio[0][lane], 1, whole);
+    double *to_V = at(s->V, in, lane, 1, 0);
+    mpm_vec ratio = A, V = get(in, lane, to_V, 1, whole);
+    if (scheme == MPM_FBAR_ANCHORED) {
+        ratio = get(in, lane, &b->ratio[1][lane], 1, whole);
+    }
+    fault_unless(trial > 0.0, r, in, lane, MPM_ERR_VOLUME, trial);
+    fault_unless(ratio > 0.0, r, in, lane, MPM_ERR_VOLUME, ratio);
+    const mpm_vec q = ratio / trial;
+    if (scheme == MPM_FBAR_ANCHORED) {
+        const mpm_vec reach = (by->C * by->inv_h) * mpm_sqrt(dx2);
+        const mpm_vec beta = mpm_min(reach, mpm_splat(1));
+        const mpm_vec V0 = get(in, lane, at(s->V0, in, lane, 1, 0), 1, whole);
+        V = (1.0 - beta) * V * A + beta * V0 * ratio;
+    } else { // eq. 15: forces use the unaveraged volume; but a fluid's follows Jbar
+        const mpm_vec dJ = get(in, lane, at(s->dJ, in, lane, 1, 0), 1, whole);
+        V = kinematics == MPM_KEEPS_J ? V * (dJ * q) : V * dJ;
+    }
+    put(in, lane, to_V, V, whole);
+    fault_unless(V > 0.0, r, in, lane, MPM_ERR_VOLUME, V);
+    if (kinematics == MPM_KEEPS_J) {
+        kept[0] = ratio;
+    } else {
+        const mpm_vec scale = dim == 2 ? mpm_sqrt(q) : mpm_cbrt(q);
+        const mpm_vec by = kinematics == MPM_KEEPS_B ? scale * scale : scale;
+        const int n = n_kept(kinematics, dim);
+        UNROLL for (int k = 0; k < n; k++) { // not b33 in plane strain
+            if (!(kinematics == MPM_KEEPS_B && dim == 2 && k == 2)) {
+                kept[k] *= by;
+            }
+        }
+    }
+    store_kept(s, in, lane, kept, dim, kinematics, whole);
+}
+
+MPM_KERNEL void update_stress(struct extent in, int lane, const struct mpm_particles *s,
+                              const int dim, const enum mpm_law law, const bool whole) {
+    const enum mpm_kinematics kinematics = kept_by(law);
+    const int n_sym = MPM_SYM(dim);
+    mpm_vec kept[9], sigma[6], a = mpm_splat(0);
+    load_kept(s, in, lane, kept, dim, kinematics, whole);
+    if (kinematics == MPM_KEEPS_J) { // adds to the rate part
+        UNROLL for (int k = 0; k < n_sym; k++) {
+            sigma[k] = get(in, lane, at(s->sigma, in, lane, n_sym, k), 0, whole);
+        }
+    }
+    if (kinematics == MPM_KEEPS_B && s->plastic_strain) {
+        a = get(in, lane, at(s->plastic_strain, in, lane, 1, 0), 0, whole);
+    }
+    stress(law, s->constants, kept, &a, sigma, dim);
+    if (kinematics == MPM_KEEPS_B) { // plastic flow changes them
+        store_kept(s, in, lane, kept, dim, kinematics, whole);
+        if (s->plastic_strain) {
+            put(in, lane, at(s->plastic_strain, in, lane, 1, 0), a, whole);
+        }
+    }
+    UNROLL for (int k = 0; k < n_sym; k++) {
+        put(in, lane, at(s->sigma, in, lane, n_sym, k), sigma[k], whole);
+    }
+}
+
+// eq. 17, by the step in b->v.
+MPM_KERNEL void update_position(struct batch *b, struct extent in, int lane, const struct mpm_particles *s,
+                                struct mpm_span_result *r, struct found *found, const int dim,
+                                const bool whole) {
+    const mpm_vec m = s->density * get(in, lane, at(s->V0, in, lane, 1, 0), 0, whole);
+    const size_t one = in.first + (size_t)in.begin; // stands for lanes that are not the batch's
+    UNROLL for (int d = 0; d < dim; d++) {
+        double *to = at(s->x, in, lane, dim, d);
+        const mpm_vec dx = get(in, lane, &b->v[d][lane], 0, whole);
+        const mpm_vec x = get(in, lane, to, s->x[mpm_at(one, dim, d)], whole) + dx;
+        put(in, lane, to, x, whole);
+        found->mass_dx[d] += m * dx;
+        found->min[d] = mpm_min(x, found->min[d]);
+        found->max[d] = mpm_max(x, found->max[d]);
+        found->dx_max = mpm_max(mpm_abs(dx), found->dx_max);
+        fault_unless(mpm_abs(x) < INFINITY, r, in, lane, MPM_ERR_NOT_FINITE, x);
+    }
+}
+
+// Stress and position of particles whose deformation is final.
+MPM_KERNEL void finish(struct batch *b, const struct mpm_particles *s, struct mpm_span_result *r,
+                       struct found *found, const int dim, const enum mpm_law law) {
+    const struct extent in = b->in;
+    struct found f = *found;
+#define STRESS(whole) update_stress(in, lane, s, dim, law, whole)
+#define POSITION(whole) update_position(b, in, lane, s, r, &f, dim, whole)
+    FOR_VECTORS(in, STRESS)
+    FOR_VECTORS(in, POSITION)
+    *found = f;
+}
+
+// eqs. 11-17 from what was gathered; with F-bar, what it will average.
+MPM_KERNEL void update(struct batch *b, const struct mpm_span *span, struct mpm_span_result *r,
+                       struct found *found, const int dim, const enum mpm_law law,
+                       const enum mpm_fbar_scheme scheme) {
+    const struct mpm_particles part = *span->s;
+    const struct by by = what_by(span);
+    const struct extent in = b->in;
+    const bool keeps_step = scheme != MPM_FBAR_OFF;
+    mpm_vec v2_max = found->v2_max;
+#define VELOCITY(whole) update_velocity(b, in, lane, &part, &by, r, &v2_max, dim, keeps_step, whole)
+#define DEFORMATION(whole) update_deformation(b, in, lane, &part, &by, r, dim, law, scheme, whole)
+    FOR_VECTORS(in, VELOCITY)
+    FOR_VECTORS(in, DEFORMATION)
+    found->v2_max = v2_max;
+    if (scheme == MPM_FBAR_OFF) {
+        finish(b, &part, r, found, dim, law);
+    }
+}
+
+// Algorithm 1, steps 4 and 5.
+MPM_KERNEL void finish_fbar(struct batch *b, const struct mpm_span *span,
+                            struct mpm_span_result *r, struct found *found, const int dim,
+                            const enum mpm_law law, const enum mpm_fbar_scheme scheme) {
+    const struct mpm_particles part = *span->s;
+    const struct by by = what_by(span);
+    const struct extent in = b->in;
+#define RESCALE(whole) rescale(b, in, lane, &part, &by, r, dim, law, scheme, whole)
+    FOR_VECTORS(in, RESCALE)
+    finish(b, &part, r, found, dim, law);
+}
+
+// The records of what the particles give to their nodes. Lanes of other tiles are read, too: P2G
+// writes no particles.
+MPM_KERNEL void write_records(struct batch *b, const struct mpm_span *span, const int dim) {
+    const struct mpm_particles part = *span->s, *s = &part;
+    const struct extent in = b->in;
+    const bool fbar = span->fbar;
+    const double inv_h = span->grid->inv_h;
+    const int n_sym = MPM_SYM(dim);
+    for (int lane = 0; lane < in.end; lane += MPM_LANES) {
+        const mpm_vec V = mpm_load_aligned(at(s->V, in, lane, 1, 0)), zero = mpm_splat(0);
+        const mpm_vec m = s->density * mpm_load_aligned(at(s->V0, in, lane, 1, 0));
+        mpm_vec mv[3], f[6];
+        UNROLL for (int d = 0; d < dim; d++) {
+            mv[d] = m * mpm_load_aligned(at(s->v, in, lane, dim, d));
+        }
+        const mpm_vec minus_V_over_h = V * -inv_h, V_fbar = fbar ? V : zero;
+        UNROLL for (int k = 0; k < n_sym; k++) { // xx yy zz xy (yz zx)
+            f[k] = minus_V_over_h * mpm_load_aligned(at(s->sigma, in, lane, n_sym, k));
+        }
+        if (dim == 2) {
+            const mpm_vec record[8] = {m, mv[0], mv[1], V_fbar, f[0], f[3], f[3], f[1]};
+            mpm_transpose(record, &b->record[lane][0], 16);
+        } else {
+            const mpm_vec record[8] = {m, mv[0], mv[1], mv[2], f[0], f[3], f[5], V_fbar};
+            const mpm_vec rest[8] = {f[5], f[4], f[2], zero, f[3], f[1], f[4], zero};
+            mpm_transpose(record, &b->record[lane][0], 16);
+            mpm_transpose(rest, &b->record[lane][8], 16);
+        }
+    }
+}
+
+// ---- The kernels ----
+
+// The batches of a tile: whole blocks of particles, of which some lanes at both ends belong to
+// other tiles.
+#define FOR_BATCHES(b, span)                                                                       \
+    for (size_t first_ = (span)->begin / MPM_BLOCK * MPM_BLOCK;                                    \
+         first_ < (span)->end && batch_at((b), (span), first_); first_ += BATCH)
+
+MPM_KERNEL bool batch_at(struct batch *b, const struct mpm_span *span, size_t first) {
+    b->in = (struct extent){
+        .first = first,
+        .begin = span->begin > first ? (int)(span->begin - first) : 0,
+        .end = span->end - first < BATCH ? (int)(span->end - first) : BATCH,
+    };
+    return true;
+}
+
+MPM_KERNEL void p2g(const struct mpm_span *span, struct mpm_span_result *r, const int dim,
+                    const enum mpm_basis basis) {
+    struct batch b;
+    FOR_BATCHES(&b, span) {
+        find_cells(&b, span, dim, basis);
+        write_weights(&b, span->s, dim, basis, true);
+        write_records(&b, span, dim);
+        scatter_records(&b, span->grid, dim, basis);
+        r->n_runs += (uint32_t)b.n_runs;
+    }
+}
+
+typedef void update_lanes(struct batch *b, const struct mpm_span *span, struct mpm_span_result *r,
+                          struct found *found);
+
+#define DEFINE_UPDATE(name, keeps, D, S)                                                           \
+    static void update_##name##_##D##d_##S(struct batch *b, const struct mpm_span *span,           \
+                                           struct mpm_span_result *r, struct found *found) {       \
+        update(b, span, r, found, D, MPM_LAW_##name, MPM_FBAR_##S);                                \
+    }
+#define DEFINE_FINISH(name, keeps, D, S)                                                           \
+    static void finish_##name##_##D##d_##S(struct batch *b, const struct mpm_span *span,           \
+                                           struct mpm_span_result *r, struct found *found) {       \
+        finish_fbar(b, span, r, found, D, MPM_LAW_##name, MPM_FBAR_##S);                           \
+    }
+#define X(name, keeps)                                                                             \
+    DEFINE_UPDATE(name, keeps, 2, OFF)                                                             \
+    DEFINE_UPDATE(name, keeps, 2, ZHAO)                                                            \
+    DEFINE_UPDATE(name, keeps, 2, ANCHORED)                                                        \
+    DEFINE_UPDATE(name, keeps, 3, OFF)                                                             \
+    DEFINE_UPDATE(name, keeps, 3, ZHAO)                                                            \
+    DEFINE_UPDATE(name, keeps, 3, ANCHORED)                                                        \
+    DEFINE_FINISH(name, keeps, 2, ZHAO)                                                            \
+    DEFINE_FINISH(name, keeps, 2, ANCHORED)                                                        \
+    DEFINE_FINISH(name, keeps, 3, ZHAO)                                                            \
+    DEFINE_FINISH(name, keeps, 3, ANCHORED)
+MPM_LAWS(X)
+#undef X
+
+static update_lanes *const updates[2][MPM_N_FBAR_SCHEMES][MPM_N_LAWS] = {
+    {
+#define X(name, keeps) [MPM_LAW_##name] = update_##name##_2d_OFF,
+        {MPM_LAWS(X)},
+#undef X
+#define X(name, keeps) [MPM_LAW_##name] = update_##name##_2d_ZHAO,
+        {MPM_LAWS(X)},
+#undef X
+#define X(name, keeps) [MPM_LAW_##name] = update_##name##_2d_ANCHORED,
+        {MPM_LAWS(X)},
+#undef X
+    },
+    {
+#define X(name, keeps) [MPM_LAW_##name] = update_##name##_3d_OFF,
+        {MPM_LAWS(X)},
+#undef X
+#define X(name, keeps) [MPM_LAW_##name] = update_##name##_3d_ZHAO,
+        {MPM_LAWS(X)},
+#undef X
+#define X(name, keeps) [MPM_LAW_##name] = update_##name##_3d_ANCHORED,
+        {MPM_LAWS(X)},
+#undef X
+    },
+};
+static update_lanes *const finishes[2][MPM_N_FBAR_SCHEMES][MPM_N_LAWS] = {
+    {
+        {NULL},
+#define X(name, keeps) [MPM_LAW_##name] = finish_##name##_2d_ZHAO,
+        {MPM_LAWS(X)},
+#undef X
+#define X(name, keeps) [MPM_LAW_##name] = finish_##name##_2d_ANCHORED,
+        {MPM_LAWS(X)},
+#undef X
+    },
+    {
+        {NULL},
+#define X(name, keeps) [MPM_LAW_##name] = finish_##name##_3d_ZHAO,
+        {MPM_LAWS(X)},
+#undef X
+#define X(name, keeps) [MPM_LAW_##name] = finish_##name##_3d_ANCHORED,
+        {MPM_LAWS(X)},
+#undef X
+    },
+};
+
+MPM_KERNEL void g2p(const struct mpm_span *span, struct mpm_span_result *r, const int dim,
+                    const enum mpm_basis basis) {
+    const enum mpm_fbar_scheme scheme = span->fbar ? span->scheme : MPM_FBAR_OFF;
+    update_lanes *const update_batch = updates[dim - 2][scheme][span->s->law];
+    struct batch b;
+    struct found found;
+    found_nothing(&found);
+    FOR_BATCHES(&b, span) {
+        find_cells(&b, span, dim, basis);
+        gather(&b, span, dim, basis, 0);
+        update_batch(&b, span, r, &found);
+        if (scheme != MPM_FBAR_OFF) {
+            write_weights(&b, span->s, dim, basis, false);
+            find_rows(&b, dim, basis);
+        }
+        if (scheme == MPM_FBAR_ZHAO) {
+            scatter_ratios(&b, span->grid, dim, basis, 1);
+        } else if (scheme == MPM_FBAR_ANCHORED) {
+            scatter_ratios(&b, span->grid, dim, basis, 2);
+        }
+    }
+    found_all(&found, r, dim);
+}
+
+MPM_KERNEL void fbar(const struct mpm_span *span, struct mpm_span_result *r, const int dim,
+                     const enum mpm_basis basis, const int scalars) {
+    update_lanes *const finish_batch = finishes[dim - 2][span->scheme][span->s->law];
+    struct batch b;
+    struct found found;
+    found_nothing(&found);
+    FOR_BATCHES(&b, span) {
+        find_cells(&b, span, dim, basis);
+        gather(&b, span, dim, basis, scalars);
+        finish_batch(&b, span, r, &found);
+    }
+    found_all(&found, r, dim);
+}
+
+// eq. 9 with the components of a node in lanes.
+MPM_KERNEL void move_nodes(const struct mpm_grid *grid, uint32_t begin, uint32_t end,
+                           const struct mpm_motion *by, const int dim) {
+    const size_t nodes = MPM_BLOCK_NODES(dim);
+    const mpm_four g = {by->gravity[0], by->gravity[1], by->gravity[2], 0};
+    for (size_t i = begin * nodes; i < end * nodes; i++) {
+        const double *node = grid->node + i * MPM_NODE, m = node[0];
+        double *velocity = grid->velocity + i * (size_t)MPM_VELOCITY(dim);
+        if (!(m > 0)) {
+            memset(velocity, 0, (size_t)MPM_VELOCITY(dim) * sizeof *velocity);
+            continue;
+        }
+        const mpm_four mv = {node[1], node[2], dim == 3 ? node[3] : 0, 0};
+        const mpm_four v = mv * (1 / m);
+        mpm_four f = mpm_load_four(node + MPM_NODE_FORCE) + m * g;
+        for (int d = 0; by->local != 0 && d < dim; d++) { // sign(0) = 0
+            f[d] -= v[d] != 0 ? copysign(by->local * fabs(f[d]), v[d]) : 0;
+        }
+        f -= by->mass * mv;
+        const mpm_four dv = by->dt * f * (1 / m), now = v + dv;
+        for (int d = 0; d < dim; d++) {
+            velocity[d] = now[d];
+            velocity[dim + d] = dv[d];
+        }
+    }
+}
+
+#define DEFINE(D, B)                                                                               \
+    static void p2g_##D##d_##B(const struct mpm_span *span, struct mpm_span_result *r) {           \
+        p2g(span, r, D, MPM_##B);                                                                  \
+    }                                                                                              \
+    static void g2p_##D##d_##B(const struct mpm_span *span, struct mpm_span_result *r) {           \
+        g2p(span, r, D, MPM_##B);                                                                  \
+    }                                                                                              \
+    static void move_nodes_##D##d_##B(const struct mpm_grid *grid, uint32_t begin, uint32_t end,   \
+                                      const struct mpm_motion *motion) {                           \
+        move_nodes(grid, begin, end, motion, D);                                                   \
+    }                                                                                              \
+    static void fbar_##D##d_##B(const struct mpm_span *span, struct mpm_span_result *r) {          \
+        if (span->scheme == MPM_FBAR_ZHAO) {                                                       \
+            fbar(span, r, D, MPM_##B, 1);                                                          \
+        } else {                                                                                   \
+            fbar(span, r, D, MPM_##B, 2);                                                          \
+        }                                                                                          \
+    }
+MPM_EACH_KERNEL(DEFINE)
+
+#define ENTRY(D, B)                                                                                \
+    [(D - 2) * MPM_N_BASES + MPM_##B] = {                                                          \
+        .p2g = p2g_##D##d_##B,                                                                     \
+        .move_nodes = move_nodes_##D##d_##B,                                                       \
+        .g2p = g2p_##D##d_##B,                                                                     \
+        .fbar = fbar_##D##d_##B,                                                                   \
+    },
+const struct mpm_kernels MPM_LANES_NAME[2 * MPM_N_BASES] = {MPM_EACH_KERNEL(ENTRY)};
