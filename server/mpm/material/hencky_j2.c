@@ -28,20 +28,21 @@ MPM_KERNEL void hencky_j2_return(const struct hencky_j2 *c, mpm_vec norm, mpm_ma
                                  mpm_vec *a, mpm_vec *soft) {
     const double rate = HENCKY_J2_ROOT * c->softening; // soft' = -rate soft
     mpm_vec x = mpm_splat(0);
+    mpm_mask going = yields;
     for (int k = 0; k < 50; k++) { // quadratic: 1 where nothing softens, else 2 or 3 in practice
         const mpm_vec g = norm - c->two_mu * x - c->residual - *soft;
         const mpm_vec step = g / (c->two_mu - rate * *soft), d = rate * step;
-        x = mpm_select(yields, x + step, x);
-        // What the step leaves of g is its second order, soft d^2/2.
-        const mpm_mask done = *soft * d * d <= DBL_EPSILON * norm;
-        *soft = mpm_select(yields, *soft * (1.0 - d + 0.5 * d * d), *soft);
-        *a = mpm_select(yields & done, *a + HENCKY_J2_ROOT * x, *a);
-        yields &= mpm_not(done);
-        if (!mpm_any(yields)) {
+        // What a short step leaves of g is its second order, soft d^2/2.
+        const mpm_mask done = (*soft * d * d <= DBL_EPSILON * norm) & (d * d < 0.01);
+        x = mpm_select(going, x + step, x);
+        *soft = mpm_select(going, *soft * (1.0 - d + 0.5 * d * d), *soft);
+        going &= mpm_not(done);
+        if (!mpm_any(going)) {
             break;
         }
-        *soft = mpm_select(yields, hencky_j2_soft(c, *a + HENCKY_J2_ROOT * x), *soft);
+        *soft = mpm_select(going, hencky_j2_soft(c, *a + HENCKY_J2_ROOT * x), *soft);
     }
+    *a = mpm_select(yields, *a + HENCKY_J2_ROOT * x, *a);
 }
 
 MPM_KERNEL void hencky_j2_stress(const struct hencky_j2 *c, mpm_vec *b, mpm_vec *a, mpm_vec *sigma,
@@ -145,7 +146,7 @@ static void prepare(const double *par, void *constants) {
     c->K = bulk_modulus(par);
     c->residual = sqrt(2.0 / 3) * residual_strength(par);
     c->fall = sqrt(2.0 / 3) * (par[YIELD_STRENGTH] - residual_strength(par));
-    c->softening = par[SOFTENING];
+    c->softening = c->fall > 0 ? par[SOFTENING] : 0;
 }
 MPM_SPANS_KEEPS_B(hencky_j2)
 
