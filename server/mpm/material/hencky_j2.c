@@ -61,11 +61,11 @@ MPM_KERNEL void hencky_j2_stress(const struct hencky_j2 *c, mpm_vec *b, mpm_vec 
     mpm_vec soft = hencky_j2_soft(c, *a);
     const mpm_vec radius = (c->residual + soft) / c->two_mu; // as |dev eps|
     if (mpm_any(norm2 > radius * radius)) { // the same as `yields` but for round-off
-        const mpm_vec norm = c->two_mu * mpm_sqrt(norm2), one = mpm_splat(1);
-        const mpm_mask yields = norm > c->residual + soft;
-        const mpm_vec inverse = 1.0 / mpm_select(yields, norm, one);
+        const mpm_vec norm = c->two_mu * mpm_sqrt(norm2), limit = c->residual + soft;
+        const mpm_mask yields = norm > limit;
+        const mpm_vec inverse = 1.0 / mpm_max(norm, limit); // ready before the return is
         hencky_j2_return(c, norm, yields, a, &soft);
-        const mpm_vec back = mpm_select(yields, (c->residual + soft) * inverse, one);
+        const mpm_vec back = mpm_select(yields, (c->residual + soft) * inverse, mpm_splat(1));
         mpm_vec elastic[6], flowed[6];
         for (int k = 0; k < MPM_SYM(dim); k++) {
             e[k] *= back;
