@@ -53,6 +53,14 @@ SCENES = $(sort $(wildcard scenes/*.json))
 
 obj = $(patsubst %.c,$(B)/obj/%.o,$(1))
 
+# What is compiled once more for each instruction set (server/mpm/simd.h): x.o, x.v3.o, x.v4.o of x.c.
+ifneq ($(filter x86_64%,$(shell $(CC) -dumpmachine)),)
+LEVELS = v3 v4
+endif
+LANES.v3 = -march=x86-64-v3 -DMPM_LANES=4
+LANES.v4 = -march=x86-64-v4 -mprefer-vector-width=512 -DMPM_LANES=8
+lanes = $(call obj,$(1)) $(foreach level,$(LEVELS),$(patsubst %.c,$(B)/obj/%.$(level).o,$(1)))
+
 .PHONY: all programs deps deps-long libmpm demo check check-all check-layers check-unit check-physics check-api \
 	check-cli check-asan check-clang check-long install uninstall format clean help
 .DELETE_ON_ERROR:
@@ -95,6 +103,14 @@ $(B)/obj/%.o: %.c Makefile
 	@mkdir -p $(@D)
 	$(Q)$(CC) $(ALL_CFLAGS) -c $< -o $@
 
+define lanes_rule
+$(B)/obj/%.$(1).o: %.c Makefile
+	$$(call say,CC,$$<:$(1))
+	@mkdir -p $$(@D)
+	$$(Q)$$(CC) $$(ALL_CFLAGS) $$(LANES.$(1)) -c $$< -o $$@
+endef
+$(foreach level,$(LEVELS),$(eval $(call lanes_rule,$(level))))
+
 # The built-in scenes, embedded as they are.
 $(B)/gen/scenes_data.c: $(SCENES) Makefile
 	$(call say,EMBED,scenes)
@@ -121,6 +137,7 @@ $(B)/fbar: $(call obj,$(CLIENT_SRC)) $(call obj,$(PROTO_SRC))
 UNIT = $(patsubst tests/%.c,$(B)/tests/%,$(sort $(wildcard tests/unit/test_*.c)))
 PHYSICS = $(patsubst tests/%.c,$(B)/tests/%,$(sort $(wildcard tests/physics/test_*.c)))
 $(B)/obj/tests/%.o: ALL_CFLAGS += $(call pc_cflags,$(SERVER_LIBS) cmocka) -Wno-missing-prototypes
+$(B)/tests/unit/test_simd $(B)/tests/unit/test_laws: $(call lanes,tests/unit/lanes.c)
 $(B)/tests/%: $(B)/obj/tests/%.o $(SERVER_OBJ) $(call obj,$(PROTO_SRC)) $(B)/libmpm.a
 	$(call say,LD,$@)
 	@mkdir -p $(@D)

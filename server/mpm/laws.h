@@ -9,7 +9,8 @@
 //   KEEPS_J  name_stress(constants, J, sigma, dim)       adds to sigma what depends on J
 //            name_rate(constants, L, sigma, dim)         writes what depends on L, dim x dim
 //
-// `constants` is a const void * to what the descriptor's `prepare` made of the parameters.
+// `constants` is a const void * to what the descriptor's `prepare` made of the parameters. Lanes
+// without a particle hold the identity (F, b, J), so that they raise nothing and cost nothing.
 #pragma once
 #include "server/mpm/material.h"
 

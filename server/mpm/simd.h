@@ -265,23 +265,23 @@ MPM_KERNEL mpm_vec mpm_log(mpm_vec x) {
 }
 
 // x = k ln 2 + r with |r| <= ln(2)/2; e^r = 1 + r + r^2 (1/2 + r q(r)), q minimax (Remez, 5e-18).
-// At most 1.0 ulp off (measured).
+// At most 1.04 ulp off (measured).
 MPM_KERNEL mpm_vec mpm_exp(mpm_vec x) {
     const mpm_mask in_range = (x >= -708.0) & (x <= 709.0);
     const double round = 0x1.8p52; // added, leaves the nearest integer in the low bits
     const mpm_vec shifted = x * 1.4426950408889634 + round;
     const mpm_vec k = shifted - round;
     const mpm_vec r = (x - k * MPM_LN2_HIGH) - k * MPM_LN2_LOW;
-    mpm_vec q = 2.497820272246884e-08 * r + 2.7625188948730094e-07;
-    q = q * r + 2.755764144461859e-06;
-    q = q * r + 2.4801508679485814e-05;
-    q = q * r + 0.00019841269465584654;
-    q = q * r + 0.0013888888926796587;
-    q = q * r + 0.008333333333500293;
-    q = q * r + 0.041666666666603965;
-    q = q * r + 0.16666666666666433;
-    q = q * r + 0.5;
-    const mpm_vec y = 1.0 + (r + r * r * q);
+    const mpm_vec r2 = r * r; // even and odd powers apart: half the latency
+    mpm_vec even = 2.7625188948730094e-07 * r2 + 2.4801508679485814e-05;
+    mpm_vec odd = 2.497820272246884e-08 * r2 + 2.755764144461859e-06;
+    even = even * r2 + 0.0013888888926796587;
+    odd = odd * r2 + 0.00019841269465584654;
+    even = even * r2 + 0.041666666666603965;
+    odd = odd * r2 + 0.008333333333500293;
+    even = even * r2 + 0.5;
+    odd = odd * r2 + 0.16666666666666433;
+    const mpm_vec y = 1.0 + (r + r2 * (even + r * odd));
     return mpm_unless(in_range, (mpm_vec)((mpm_word)y + ((mpm_word)shifted << 52)), exp, x);
 }
 

@@ -9,8 +9,8 @@
 
 struct hencky_j2 {
     double two_mu, K; // Pa
-    double residual,
-        fall;         // Pa, sqrt(2/3) of the residual strength and of the peak's excess over it
+    double residual;  // Pa, sqrt(2/3) of the residual strength
+    double fall;      // Pa, sqrt(2/3) of the peak's excess over it
     double softening; // 1
 };
 
@@ -26,22 +26,27 @@ MPM_KERNEL mpm_vec hencky_j2_soft(const struct hencky_j2 *c, mpm_vec a) {
 // falling, so Newton's iterates come down to the root from above after the first.
 MPM_KERNEL void hencky_j2_return(const struct hencky_j2 *c, mpm_vec norm, mpm_mask yields,
                                  mpm_vec *a, mpm_vec *soft) {
+    if (!(c->fall > 0)) {
+        *a = mpm_select(yields, *a + HENCKY_J2_ROOT / c->two_mu * (norm - c->residual), *a);
+        return;
+    }
     const double rate = HENCKY_J2_ROOT * c->softening; // soft' = -rate soft
     mpm_vec x = mpm_splat(0);
-    for (int k = 0; k < 50; k++) { // quadratic: 1 where nothing softens, else 2 or 3 in practice
+    mpm_mask going = yields;
+    for (int k = 0; k < 50; k++) { // quadratic: 2 or 3 in practice
         const mpm_vec g = norm - c->two_mu * x - c->residual - *soft;
         const mpm_vec step = g / (c->two_mu - rate * *soft), d = rate * step;
-        x = mpm_select(yields, x + step, x);
-        // What the step leaves of g is its second order, soft d^2/2.
-        const mpm_mask done = *soft * d * d <= DBL_EPSILON * norm;
-        *soft = mpm_select(yields, *soft * (1.0 - d + 0.5 * d * d), *soft);
-        *a = mpm_select(yields & done, *a + HENCKY_J2_ROOT * x, *a);
-        yields &= mpm_not(done);
-        if (!mpm_any(yields)) {
+        // What a short step leaves of g is its second order, soft d^2/2.
+        const mpm_mask done = (*soft * d * d <= DBL_EPSILON * norm) & (d * d < 0.01);
+        x = mpm_select(going, x + step, x);
+        *soft = mpm_select(going, *soft * (1.0 - d + 0.5 * d * d), *soft);
+        going &= mpm_not(done);
+        if (!mpm_any(going)) {
             break;
         }
-        *soft = mpm_select(yields, hencky_j2_soft(c, *a + HENCKY_J2_ROOT * x), *soft);
+        *soft = mpm_select(going, hencky_j2_soft(c, *a + HENCKY_J2_ROOT * x), *soft);
     }
+    *a = mpm_select(yields, *a + HENCKY_J2_ROOT * x, *a);
 }
 
 MPM_KERNEL void hencky_j2_stress(const struct hencky_j2 *c, mpm_vec *b, mpm_vec *a, mpm_vec *sigma,
@@ -53,14 +58,14 @@ MPM_KERNEL void hencky_j2_stress(const struct hencky_j2 *c, mpm_vec *b, mpm_vec 
         e[k] = k < 3 ? e[k] - mean : e[k];
         norm2 += (k < 3 ? 1.0 : 2.0) * e[k] * e[k];
     }
-    const mpm_vec norm = c->two_mu * mpm_sqrt(norm2);
     mpm_vec soft = hencky_j2_soft(c, *a);
-    const mpm_mask yields = norm > c->residual + soft;
-    if (mpm_any(yields)) {
+    const mpm_vec radius = (c->residual + soft) / c->two_mu; // as |dev eps|
+    if (mpm_any(norm2 > radius * radius)) { // the same as `yields` but for round-off
+        const mpm_vec norm = c->two_mu * mpm_sqrt(norm2), limit = c->residual + soft;
+        const mpm_mask yields = norm > limit;
+        const mpm_vec inverse = 1.0 / mpm_max(norm, limit); // ready before the return is
         hencky_j2_return(c, norm, yields, a, &soft);
-        const mpm_vec one = mpm_splat(1);
-        const mpm_vec back =
-            mpm_select(yields, c->residual + soft, one) / mpm_select(yields, norm, one);
+        const mpm_vec back = mpm_select(yields, (c->residual + soft) * inverse, mpm_splat(1));
         mpm_vec elastic[6], flowed[6];
         for (int k = 0; k < MPM_SYM(dim); k++) {
             e[k] *= back;
@@ -145,7 +150,7 @@ static void prepare(const double *par, void *constants) {
     c->K = bulk_modulus(par);
     c->residual = sqrt(2.0 / 3) * residual_strength(par);
     c->fall = sqrt(2.0 / 3) * (par[YIELD_STRENGTH] - residual_strength(par));
-    c->softening = par[SOFTENING];
+    c->softening = c->fall > 0 ? par[SOFTENING] : 0;
 }
 MPM_SPANS_KEEPS_B(hencky_j2)
 
