@@ -45,7 +45,9 @@ pc_cflags = $(shell $(PKG_CONFIG) --cflags $(1))
 pc_libs = $(shell $(PKG_CONFIG) --libs $(1))
 HDF5_PC = $(shell $(PKG_CONFIG) --exists hdf5 && echo hdf5 || echo hdf5-serial)
 
-MPM_SRC = $(filter-out %/transfer_lanes.c,$(sort $(wildcard server/mpm/*.c server/mpm/material/*.c)))
+# The kernels in lanes exist for instruction sets only, without a baseline.
+LANES_SRC = server/mpm/transfer_2d.c server/mpm/transfer_3d.c
+MPM_SRC = $(filter-out $(LANES_SRC),$(sort $(wildcard server/mpm/*.c server/mpm/material/*.c)))
 PROTO_SRC = $(sort $(wildcard proto/*.c))
 SERVER_SRC = $(sort $(wildcard server/*.c))
 CLIENT_SRC = $(sort $(wildcard client/*.c))
@@ -59,7 +61,11 @@ LEVELS = v3 v4
 endif
 LANES.v3 = -march=x86-64-v3 -DMPM_LANES=4
 LANES.v4 = -march=x86-64-v4 -mprefer-vector-width=512 -DMPM_LANES=8
-lanes = $(call obj,$(1)) $(foreach level,$(LEVELS),$(patsubst %.c,$(B)/obj/%.$(level).o,$(1)))
+levels = $(foreach level,$(LEVELS),$(patsubst %.c,$(B)/obj/%.$(level).o,$(1)))
+lanes = $(call obj,$(1)) $(call levels,$(1))
+$(B)/obj/server/mpm/kernels.o: ALL_CFLAGS += $(if $(LEVELS),-DMPM_HAS_LANES)
+# Written in vectors: what the compiler would vectorise or unroll besides is scalar for a reason.
+$(call levels,$(LANES_SRC)): ALL_CFLAGS += -O2 -fno-tree-vectorize -fno-tree-slp-vectorize
 
 .PHONY: all programs deps deps-long libmpm demo check check-all check-layers check-unit check-physics check-api \
 	check-cli check-asan check-clang check-long install uninstall format clean help
@@ -74,20 +80,9 @@ build/fbard: $(B)/fbard
 build/fbar: $(B)/fbar
 	$(Q)cp $< $@.new && mv $@.new $@
 
-# The kernels in lanes: one unit for each instruction set, of which the machine's best is used.
-LANES_FLAGS.avx2 = -march=x86-64-v3 -DMPM_LANES=4 -DMPM_LANES_NAME=mpm_kernels_avx2
-LANES_FLAGS.avx512 = -march=x86-64-v4 -mprefer-vector-width=512 -DMPM_LANES=8 -DMPM_LANES_NAME=mpm_kernels_avx512
-LANES = $(if $(filter x86_64-%,$(shell $(CC) -dumpmachine)),avx2 avx512)
-LANES_OBJ = $(patsubst %,$(B)/obj/server/mpm/transfer_lanes.%.o,$(LANES))
-$(B)/obj/server/mpm/kernels.o: ALL_CFLAGS += $(if $(LANES),-DMPM_HAS_LANES)
-$(LANES_OBJ): $(B)/obj/server/mpm/transfer_lanes.%.o: server/mpm/transfer_lanes.c Makefile
-	$(call say,CC,"$< for $*")
-	@mkdir -p $(@D)
-	$(Q)$(CC) $(ALL_CFLAGS) $(LANES_FLAGS.$*) -c $< -o $@
-
 libmpm: $(B)/libmpm.a ## the solver library alone: needs a compiler and nothing else
 
-$(B)/libmpm.a: $(call obj,$(MPM_SRC)) $(LANES_OBJ)
+$(B)/libmpm.a: $(call obj,$(MPM_SRC)) $(call levels,$(LANES_SRC))
 	$(call say,AR,$@)
 	$(Q)rm -f $@ && $(AR) rcs $@ $^
 

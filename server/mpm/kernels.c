@@ -30,12 +30,14 @@ enum mpm_isa mpm_isa_in_use(enum mpm_isa isa) {
 }
 
 const struct mpm_kernels *mpm_kernels(int dim, enum mpm_basis basis, enum mpm_isa isa) {
-    const size_t k = (size_t)(dim - 2) * MPM_N_BASES + basis;
 #ifdef MPM_HAS_LANES
-    if (isa == MPM_ISA_AVX2 || isa == MPM_ISA_AVX512) {
-        return isa == MPM_ISA_AVX2 ? &mpm_kernels_avx2[k] : &mpm_kernels_avx512[k];
+    if (isa == MPM_ISA_AVX2) {
+        return dim == 2 ? &mpm_kernels_avx2_2d[basis] : &mpm_kernels_avx2_3d[basis];
+    }
+    if (isa == MPM_ISA_AVX512) {
+        return dim == 2 ? &mpm_kernels_avx512_2d[basis] : &mpm_kernels_avx512_3d[basis];
     }
 #endif
     (void)isa;
-    return &mpm_kernels_plain[k];
+    return &mpm_kernels_plain[(dim - 2) * MPM_N_BASES + (int)basis];
 }

@@ -1,5 +1,5 @@
-// Particle-grid transfers in lanes: what server/mpm/transfer.c does, many particles at a time. The
-// file is compiled once for each instruction set, with MPM_LANES and MPM_LANES_NAME.
+// Particle-grid transfers in lanes: what server/mpm/transfer.c does, many particles at a time. A unit
+// that defines DIM includes it, and is compiled once for each instruction set, with MPM_LANES.
 //
 // A tile is worked on in batches that stay in the first-level cache, in four stages (docs/design.md
 // has the picture):
@@ -13,8 +13,6 @@
 //             registers and are added to the grid once a run
 //
 // Arithmetic differs from the plain kernels' in the order of sums only.
-#include "server/mpm/transfer.h"
-
 #include <string.h>
 
 #include "server/mpm/basis.h"
@@ -122,8 +120,8 @@ MPM_KERNEL void find_cells(struct batch *b, const struct mpm_span *span, const i
             const mpm_vec base = mpm_base(basis, xi, s->half);
             const mpm_vec of = mpm_floor(base * (1.0 / MPM_EDGE));
             block = d == 0 ? of : block * (double)g->n_blocks[d] + of;
-            const mpm_vec in = base - of * (double)MPM_EDGE;
-            cell = d == 0 ? in : cell * (double)MPM_EDGE + in;
+            const mpm_vec inner = base - of * (double)MPM_EDGE;
+            cell = d == 0 ? inner : cell * (double)MPM_EDGE + inner;
             mpm_store_aligned(&b->t[d][lane], xi - base);
         }
         mpm_store_int32(&key[lane], block * (double)MPM_BLOCK_NODES(dim) + cell);
@@ -770,11 +768,11 @@ MPM_KERNEL void rescale(struct batch *b, struct extent in, int lane,
         kept[0] = ratio;
     } else {
         const mpm_vec scale = dim == 2 ? mpm_sqrt(q) : mpm_cbrt(q);
-        const mpm_vec by = kinematics == MPM_KEEPS_B ? scale * scale : scale;
+        const mpm_vec factor = kinematics == MPM_KEEPS_B ? scale * scale : scale;
         const int n = n_kept(kinematics, dim);
         UNROLL for (int k = 0; k < n; k++) { // not b33 in plane strain
             if (!(kinematics == MPM_KEEPS_B && dim == 2 && k == 2)) {
-                kept[k] *= by;
+                kept[k] *= factor;
             }
         }
     }
@@ -932,79 +930,43 @@ MPM_KERNEL void p2g(const struct mpm_span *span, struct mpm_span_result *r, cons
 typedef void update_lanes(struct batch *b, const struct mpm_span *span, struct mpm_span_result *r,
                           struct found *found);
 
-#define DEFINE_UPDATE(name, keeps, D, S)                                                           \
-    static void update_##name##_##D##d_##S(struct batch *b, const struct mpm_span *span,           \
-                                           struct mpm_span_result *r, struct found *found) {       \
-        update(b, span, r, found, D, MPM_LAW_##name, MPM_FBAR_##S);                                \
+// By law and scheme, the same for every basis.
+#define DEFINE_UPDATE(name, S)                                                                     \
+    static void update_##name##_##S(struct batch *b, const struct mpm_span *span,                  \
+                                    struct mpm_span_result *r, struct found *found) {              \
+        update(b, span, r, found, DIM, MPM_LAW_##name, MPM_FBAR_##S);                              \
     }
-#define DEFINE_FINISH(name, keeps, D, S)                                                           \
-    static void finish_##name##_##D##d_##S(struct batch *b, const struct mpm_span *span,           \
-                                           struct mpm_span_result *r, struct found *found) {       \
-        finish_fbar(b, span, r, found, D, MPM_LAW_##name, MPM_FBAR_##S);                           \
+#define DEFINE_FINISH(name, S)                                                                     \
+    static void finish_##name##_##S(struct batch *b, const struct mpm_span *span,                  \
+                                    struct mpm_span_result *r, struct found *found) {              \
+        finish_fbar(b, span, r, found, DIM, MPM_LAW_##name, MPM_FBAR_##S);                         \
     }
 #define X(name, keeps)                                                                             \
-    DEFINE_UPDATE(name, keeps, 2, OFF)                                                             \
-    DEFINE_UPDATE(name, keeps, 2, ZHAO)                                                            \
-    DEFINE_UPDATE(name, keeps, 2, ANCHORED)                                                        \
-    DEFINE_UPDATE(name, keeps, 3, OFF)                                                             \
-    DEFINE_UPDATE(name, keeps, 3, ZHAO)                                                            \
-    DEFINE_UPDATE(name, keeps, 3, ANCHORED)                                                        \
-    DEFINE_FINISH(name, keeps, 2, ZHAO)                                                            \
-    DEFINE_FINISH(name, keeps, 2, ANCHORED)                                                        \
-    DEFINE_FINISH(name, keeps, 3, ZHAO)                                                            \
-    DEFINE_FINISH(name, keeps, 3, ANCHORED)
+    DEFINE_UPDATE(name, OFF)                                                                       \
+    DEFINE_UPDATE(name, ZHAO)                                                                      \
+    DEFINE_UPDATE(name, ANCHORED)                                                                  \
+    DEFINE_FINISH(name, ZHAO)                                                                      \
+    DEFINE_FINISH(name, ANCHORED)
 MPM_LAWS(X)
 #undef X
 
-static update_lanes *const updates[2][MPM_N_FBAR_SCHEMES][MPM_N_LAWS] = {
-    {
-#define X(name, keeps) [MPM_LAW_##name] = update_##name##_2d_OFF,
-        {MPM_LAWS(X)},
+static update_lanes *const updates[MPM_N_LAWS][MPM_N_FBAR_SCHEMES] = {
+#define X(name, keeps)                                                                             \
+    [MPM_LAW_##name] = {update_##name##_OFF, update_##name##_ZHAO, update_##name##_ANCHORED},
+    MPM_LAWS(X)
 #undef X
-#define X(name, keeps) [MPM_LAW_##name] = update_##name##_2d_ZHAO,
-        {MPM_LAWS(X)},
-#undef X
-#define X(name, keeps) [MPM_LAW_##name] = update_##name##_2d_ANCHORED,
-        {MPM_LAWS(X)},
-#undef X
-    },
-    {
-#define X(name, keeps) [MPM_LAW_##name] = update_##name##_3d_OFF,
-        {MPM_LAWS(X)},
-#undef X
-#define X(name, keeps) [MPM_LAW_##name] = update_##name##_3d_ZHAO,
-        {MPM_LAWS(X)},
-#undef X
-#define X(name, keeps) [MPM_LAW_##name] = update_##name##_3d_ANCHORED,
-        {MPM_LAWS(X)},
-#undef X
-    },
 };
-static update_lanes *const finishes[2][MPM_N_FBAR_SCHEMES][MPM_N_LAWS] = {
-    {
-        {NULL},
-#define X(name, keeps) [MPM_LAW_##name] = finish_##name##_2d_ZHAO,
-        {MPM_LAWS(X)},
+static update_lanes *const finishes[MPM_N_LAWS][MPM_N_FBAR_SCHEMES] = {
+#define X(name, keeps)                                                                             \
+    [MPM_LAW_##name] = {NULL, finish_##name##_ZHAO, finish_##name##_ANCHORED},
+    MPM_LAWS(X)
 #undef X
-#define X(name, keeps) [MPM_LAW_##name] = finish_##name##_2d_ANCHORED,
-        {MPM_LAWS(X)},
-#undef X
-    },
-    {
-        {NULL},
-#define X(name, keeps) [MPM_LAW_##name] = finish_##name##_3d_ZHAO,
-        {MPM_LAWS(X)},
-#undef X
-#define X(name, keeps) [MPM_LAW_##name] = finish_##name##_3d_ANCHORED,
-        {MPM_LAWS(X)},
-#undef X
-    },
 };
 
 MPM_KERNEL void g2p(const struct mpm_span *span, struct mpm_span_result *r, const int dim,
                     const enum mpm_basis basis) {
     const enum mpm_fbar_scheme scheme = span->fbar ? span->scheme : MPM_FBAR_OFF;
-    update_lanes *const update_batch = updates[dim - 2][scheme][span->s->law];
+    update_lanes *const update_batch = updates[span->s->law][scheme];
     struct batch b;
     struct found found;
     found_nothing(&found);
@@ -1027,7 +989,7 @@ MPM_KERNEL void g2p(const struct mpm_span *span, struct mpm_span_result *r, cons
 
 MPM_KERNEL void fbar(const struct mpm_span *span, struct mpm_span_result *r, const int dim,
                      const enum mpm_basis basis, const int scalars) {
-    update_lanes *const finish_batch = finishes[dim - 2][span->scheme][span->s->law];
+    update_lanes *const finish_batch = finishes[span->s->law][span->scheme];
     struct batch b;
     struct found found;
     found_nothing(&found);
@@ -1066,31 +1028,35 @@ MPM_KERNEL void move_nodes(const struct mpm_grid *grid, uint32_t begin, uint32_t
     }
 }
 
-#define DEFINE(D, B)                                                                               \
-    static void p2g_##D##d_##B(const struct mpm_span *span, struct mpm_span_result *r) {           \
-        p2g(span, r, D, MPM_##B);                                                                  \
+#define BASES(X) X(LINEAR) X(GIMP) X(BSPLINE2) X(BSPLINE3)
+#define DEFINE(B)                                                                                  \
+    static void p2g_##B(const struct mpm_span *span, struct mpm_span_result *r) {                  \
+        p2g(span, r, DIM, MPM_##B);                                                                \
     }                                                                                              \
-    static void g2p_##D##d_##B(const struct mpm_span *span, struct mpm_span_result *r) {           \
-        g2p(span, r, D, MPM_##B);                                                                  \
+    static void g2p_##B(const struct mpm_span *span, struct mpm_span_result *r) {                  \
+        g2p(span, r, DIM, MPM_##B);                                                                \
     }                                                                                              \
-    static void move_nodes_##D##d_##B(const struct mpm_grid *grid, uint32_t begin, uint32_t end,   \
-                                      const struct mpm_motion *motion) {                           \
-        move_nodes(grid, begin, end, motion, D);                                                   \
-    }                                                                                              \
-    static void fbar_##D##d_##B(const struct mpm_span *span, struct mpm_span_result *r) {          \
+    static void fbar_##B(const struct mpm_span *span, struct mpm_span_result *r) {                 \
         if (span->scheme == MPM_FBAR_ZHAO) {                                                       \
-            fbar(span, r, D, MPM_##B, 1);                                                          \
+            fbar(span, r, DIM, MPM_##B, 1);                                                        \
         } else {                                                                                   \
-            fbar(span, r, D, MPM_##B, 2);                                                          \
+            fbar(span, r, DIM, MPM_##B, 2);                                                        \
         }                                                                                          \
     }
-MPM_EACH_KERNEL(DEFINE)
+BASES(DEFINE)
 
-#define ENTRY(D, B)                                                                                \
-    [(D - 2) * MPM_N_BASES + MPM_##B] = {                                                          \
-        .p2g = p2g_##D##d_##B,                                                                     \
-        .move_nodes = move_nodes_##D##d_##B,                                                       \
-        .g2p = g2p_##D##d_##B,                                                                     \
-        .fbar = fbar_##D##d_##B,                                                                   \
-    },
-const struct mpm_kernels MPM_LANES_NAME[2 * MPM_N_BASES] = {MPM_EACH_KERNEL(ENTRY)};
+static void move_nodes_of(const struct mpm_grid *grid, uint32_t begin, uint32_t end,
+                          const struct mpm_motion *motion) {
+    move_nodes(grid, begin, end, motion, DIM);
+}
+
+#define ENTRY(B)                                                                                   \
+    [MPM_##B] = {                                                                                  \
+        .p2g = p2g_##B, .move_nodes = move_nodes_of, .g2p = g2p_##B, .fbar = fbar_##B},
+#define NAME_OF(isa, dim) mpm_kernels_##isa##_##dim##d
+#define NAME(isa, dim) NAME_OF(isa, dim)
+#if MPM_LANES == 4
+const struct mpm_kernels NAME(avx2, DIM)[MPM_N_BASES] = {BASES(ENTRY)};
+#else
+const struct mpm_kernels NAME(avx512, DIM)[MPM_N_BASES] = {BASES(ENTRY)};
+#endif

@@ -1,0 +1,525 @@
+// What the solver costs, and against what: `make bench`.
+//
+// Machines are noisy, so nothing here is measured alone: the things compared take turns, round by
+// round, in one process, and what is printed is the median of the rounds' ratios. Two calibrations
+// take their turn, too: independent fused multiply-adds in vectors, and an update in place of an
+// array that no cache holds. They say what the machine could do in the same moments, and the limits
+// in the table are those of its arithmetic or its memory, from the counts of docs/design.md.
+//
+// bench [--quick] [--json FILE] [FILTER]: only groups whose name contains FILTER.
+#include <math.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <time.h>
+
+#include "server/mpm/sim.h"
+
+#define MAX_ROUNDS 15
+
+enum { RUBBER, WATER, CLAY, FLOWING, N_MATERIALS };
+static const char *const material_names[] = {"neo_hookean", "newtonian", "hencky_j2",
+                                             "hencky_j2 flowing"};
+
+static bool quick;
+static FILE *json;
+static const char *filter = "";
+static int n_rows;
+
+static double now(void) {
+    struct timespec t;
+    clock_gettime(CLOCK_MONOTONIC, &t);
+    return (double)t.tv_sec + 1e-9 * (double)t.tv_nsec;
+}
+
+// ---- Calibration ----
+
+#if defined __x86_64__
+#include <immintrin.h>
+// Seconds of one fused multiply-add of the widest vectors, with enough of them independent.
+__attribute__((target("avx512f"))) static double fma_512(long n) {
+    __m512d a[12];
+    for (int i = 0; i < 12; i++) {
+        a[i] = _mm512_set1_pd(i);
+    }
+    const __m512d x = _mm512_set1_pd(1.0000001), y = _mm512_set1_pd(1e-9);
+    const double t = now();
+    for (long k = 0; k < n; k += 12) {
+#pragma GCC unroll 12
+        for (int i = 0; i < 12; i++) {
+            a[i] = _mm512_fmadd_pd(a[i], x, y);
+            __asm__ volatile("" : "+v"(a[i]));
+        }
+    }
+    return (now() - t) / (double)n;
+}
+__attribute__((target("avx2,fma"))) static double fma_256(long n) {
+    __m256d a[12];
+    for (int i = 0; i < 12; i++) {
+        a[i] = _mm256_set1_pd(i);
+    }
+    const __m256d x = _mm256_set1_pd(1.0000001), y = _mm256_set1_pd(1e-9);
+    const double t = now();
+    for (long k = 0; k < n; k += 12) {
+#pragma GCC unroll 12
+        for (int i = 0; i < 12; i++) {
+            a[i] = _mm256_fmadd_pd(a[i], x, y);
+            __asm__ volatile("" : "+x"(a[i]));
+        }
+    }
+    return (now() - t) / (double)n;
+}
+#endif
+
+// Seconds per multiply-add of one double, in the widest vectors that the kernels use.
+static double fma_seconds(void) {
+#if defined __x86_64__
+    if (mpm_isa_available(MPM_ISA_AVX512)) {
+        return fma_512(3000000) / 8;
+    }
+    if (mpm_isa_available(MPM_ISA_AVX2)) {
+        return fma_256(3000000) / 4;
+    }
+#endif
+    return NAN;
+}
+
+// Seconds per byte that is read or written, of an array of 64 MB updated in place.
+static double memory_seconds(void) {
+    static double *array;
+    const size_t n = 8 << 20;
+    if (!array) {
+        array = calloc(n, sizeof *array);
+    }
+    const double t = now();
+    for (size_t i = 0; i < n; i++) {
+        array[i] = array[i] * 0.5 + 1;
+    }
+    return (now() - t) / (double)(n * 2 * sizeof *array);
+}
+
+// ---- Cases ----
+
+struct block {
+    int dim, per_direction, material, n_threads;
+    double n; // particles
+    enum mpm_basis basis;
+    enum mpm_fbar_scheme scheme;
+    enum mpm_isa isa;
+    double room;    // cells of domain beyond the block on every side
+    int n_probes;   // declared, none of them asked for
+    bool fbar_once; // F-bar was on in the first step
+};
+
+static struct world {
+    struct mpm_def def;
+    struct mpm_material_def material;
+    struct mpm_body_def body;
+    struct mpm_stage_def stage;
+    struct mpm_probe_def probes[8];
+} worlds[4];
+
+// A free block in its second mode along x: it stays where it is, and strains everywhere.
+static struct mpm_sim *create(int which, struct block b) {
+    struct world *w = &worlds[which];
+    memset(w, 0, sizeof *w);
+    static const char *const models[] = {"neo_hookean", "newtonian", "hencky_j2", "hencky_j2"};
+    static const double parameters[N_MATERIALS][6] = {
+        [RUBBER] = {1000, 1e6, 0.45},
+        [WATER] = {1000, 1e6, 1},
+        [CLAY] = {1000, 1e6, 0.45, 1e5, 1e5, 0},
+        [FLOWING] = {1000, 1e6, 0.45, 10, 5, 3},
+    };
+    w->def = mpm_def_default();
+    w->material = (struct mpm_material_def){
+        .name = "material", .model = mpm_material_find(models[b.material]), .fbar = true};
+    memcpy(w->material.parameters, parameters[b.material], sizeof parameters[0]);
+    const int cells = (int)lround(pow(b.n / pow(b.per_direction, b.dim), 1.0 / b.dim));
+    w->body = (struct mpm_body_def){.name = "block", .particles_per_direction = b.per_direction};
+    for (int d = 0; d < b.dim; d++) {
+        w->body.shape.min[d] = 4;
+        w->body.shape.max[d] = 4 + cells;
+        w->def.domain_max[d] = cells + 8 + b.room;
+    }
+    w->body.velocity = (struct mpm_velocity){
+        .kind = MPM_VELOCITY_MODE, .number = 2, .from = 4, .length = cells, .amplitude = 0.3};
+    for (int k = 0; k < b.n_probes; k++) {
+        w->probes[k] =
+            (struct mpm_probe_def){.name = "probe", .kind = MPM_PROBE_ENERGY, .body = -1, .scale = 1};
+    }
+    w->stage = (struct mpm_stage_def){.name = "main", .duration = 1e9};
+    w->def.dimension = b.dim;
+    w->def.cell = 1;
+    w->def.basis = b.basis;
+    w->def.settings.fbar.scheme = b.scheme;
+    w->def.isa = b.isa;
+    w->def.n_threads = b.n_threads;
+    w->def.clock = now;
+    w->def.n_materials = w->def.n_bodies = w->def.n_stages = 1;
+    w->def.n_probes = (size_t)b.n_probes;
+    w->def.probes = w->probes;
+    w->def.materials = &w->material;
+    w->def.bodies = &w->body;
+    w->def.stages = &w->stage;
+    struct mpm_sim *sim = NULL;
+    struct mpm_error err = {0};
+    struct mpm_settings on = w->def.settings;
+    on.fbar.scheme = MPM_FBAR_ZHAO;
+    if (mpm_create(&w->def, &sim, &err) ||
+        (b.fbar_once && (mpm_change(sim, &on, MPM_SET_FBAR, &err) || mpm_step(sim, &err) ||
+                         mpm_change(sim, &w->def.settings, MPM_SET_FBAR, &err)))) {
+        fprintf(stderr, "bench: %s %s\n", err.pointer, err.message);
+        exit(1);
+    }
+    return sim;
+}
+
+// Seconds per particle and step, of steps that take about the time given.
+static double timed(struct mpm_sim *sim, double seconds) {
+    struct mpm_error err = {0};
+    const double n = (double)mpm_n_particles(sim), t = now();
+    int steps = 0;
+    do {
+        if (mpm_step(sim, &err)) {
+            fprintf(stderr, "bench: %s\n", err.message);
+            exit(1);
+        }
+        steps++;
+    } while (now() - t < seconds);
+    return (now() - t) / n / steps;
+}
+
+static int by_value(const void *a, const void *b) {
+    const double x = *(const double *)a, y = *(const double *)b;
+    return (x > y) - (x < y);
+}
+static double median(const double *values, int n) {
+    double sorted[MAX_ROUNDS];
+    memcpy(sorted, values, (size_t)n * sizeof *sorted);
+    qsort(sorted, (size_t)n, sizeof *sorted, by_value);
+    return n % 2 ? sorted[n / 2] : (sorted[n / 2 - 1] + sorted[n / 2]) / 2;
+}
+
+static double bytes_per_particle(const struct mpm_sim *sim) {
+    return (double)mpm_bytes(sim) / (double)mpm_n_particles(sim);
+}
+
+static void open_row(const char *group) {
+    fprintf(json, "%s\n  {\"group\": \"%s\"", n_rows++ ? "," : "", group);
+}
+static void number(const char *key, double value) {
+    if (isfinite(value)) {
+        fprintf(json, ", \"%s\": %.6g", key, value);
+    }
+}
+static void text(const char *key, const char *value) {
+    fprintf(json, ", \"%s\": \"%s\"", key, value);
+}
+static void describe(struct block b, size_t n) {
+    number("dimension", b.dim);
+    number("particles_per_cell", pow(b.per_direction, b.dim));
+    number("particles", (double)n);
+    text("basis", mpm_basis_name(b.basis));
+    text("fbar", mpm_fbar_name(b.scheme));
+    text("material", material_names[b.material]);
+    text("isa", mpm_isa_name(mpm_isa_in_use(b.isa)));
+    number("threads", b.n_threads);
+}
+
+static bool wanted(const char *group) {
+    return strstr(group, filter) != NULL;
+}
+
+// ---- Kernels against the plain ones ----
+
+// Multiply-adds of one double and bytes that a particle takes at the least (docs/design.md).
+struct limit {
+    double flops, bytes;
+};
+static struct limit limit_of(struct block b) {
+    const bool fbar = b.scheme != MPM_FBAR_OFF;
+    return b.dim == 2 ? (struct limit){fbar ? 315 : 240, fbar ? 320 : 144}
+                      : (struct limit){fbar ? 1150 : 960, fbar ? 520 : 256};
+}
+
+// `goal`: how many times as fast as the plain kernels performance.md asks for, 0 = no goal.
+static void kernel_row(const char *group, struct block b, double goal) {
+    const int rounds = quick ? 3 : 9;
+    const double turn = quick ? 0.03 : 0.06;
+    struct block plain = b;
+    plain.isa = MPM_ISA_BASELINE;
+    struct mpm_sim *fast = create(0, b), *slow = create(1, plain);
+    double ns[MAX_ROUNDS], ratio[MAX_ROUNDS], share[MAX_ROUNDS], fma[MAX_ROUNDS];
+    timed(fast, turn / 2);
+    timed(slow, turn / 2);
+    for (int r = 0; r < rounds; r++) {
+        const double f = timed(fast, turn), s = timed(slow, turn);
+        const double flop = fma_seconds(), byte = memory_seconds();
+        const struct limit limit = limit_of(b);
+        const double in_cache = (double)mpm_bytes(fast) < 8e6 ? 0 : limit.bytes * byte;
+        ns[r] = 1e9 * f;
+        ratio[r] = s / f;
+        fma[r] = 1e9 * flop;
+        share[r] = fmax(limit.flops * flop, in_cache) / f;
+    }
+    const double times = median(ratio, rounds);
+    char verdict[40] = "";
+    if (goal > 0) {
+        snprintf(verdict, sizeof verdict, "%s (goal %.1f, gate %.1f)",
+                 times >= goal         ? "met"
+                 : times >= goal / 1.25 ? "gate met"
+                                        : "MISSED",
+                 goal, goal / 1.25);
+    }
+    printf("%dD %2.0f/cell %8zu %-8s %-8s %-17s %-6s %d thr %7.1f ns %6.1f M/s %5.2fx plain %3.0f %% of "
+           "limit %4.0f B  %s\n",
+           b.dim, pow(b.per_direction, b.dim), mpm_n_particles(fast), mpm_basis_name(b.basis),
+           mpm_fbar_name(b.scheme), material_names[b.material], mpm_isa_name(fast->isa), b.n_threads,
+           median(ns, rounds), 1e3 / median(ns, rounds), times, 100 * median(share, rounds),
+           bytes_per_particle(fast), verdict);
+    fflush(stdout);
+    open_row(group);
+    describe(b, mpm_n_particles(fast));
+    number("ns_per_particle_step", median(ns, rounds));
+    number("times_plain", times);
+    number("share_of_limit", median(share, rounds));
+    number("fma_ns", median(fma, rounds));
+    number("bytes_per_particle", bytes_per_particle(fast));
+    number("goal", goal > 0 ? goal : NAN);
+    if (goal > 0) {
+        text("verdict", times >= goal ? "goal met" : times >= goal / 1.25 ? "gate met" : "missed");
+    }
+    fprintf(json, "}");
+    mpm_free(fast);
+    mpm_free(slow);
+}
+
+static struct block block_of(int dim, int per_direction, double n, enum mpm_fbar_scheme scheme) {
+    return (struct block){.dim = dim,
+                          .per_direction = per_direction,
+                          .n = n,
+                          .basis = MPM_BSPLINE2,
+                          .scheme = scheme,
+                          .n_threads = 1};
+}
+
+static void kernels(void) {
+    if (!wanted("kernels")) {
+        return;
+    }
+    puts("\nKernels: the machine's best against the plain scalar ones of the same binary");
+    static const struct {
+        int dim, per_direction;
+        double n, goal[2]; // standard, F-bar
+    } cases[] = {{2, 2, 1e4, {6, 5.3}},  {2, 2, 1e5, {6, 5.3}},  {2, 2, 1e6, {6, 5.3}},
+                 {2, 4, 1e4, {7.5, 7}},  {2, 4, 1e5, {7.5, 7}},  {2, 4, 1e6, {7.5, 7}},
+                 {3, 2, 1e5, {6, 6}},    {3, 2, 1e6, {6, 6}}};
+    for (size_t k = 0; k < sizeof cases / sizeof *cases; k++) {
+        for (int scheme = 0; scheme < MPM_N_FBAR_SCHEMES; scheme++) {
+            if (quick && cases[k].n > 1e5) {
+                continue;
+            }
+            kernel_row("kernels",
+                       block_of(cases[k].dim, cases[k].per_direction, cases[k].n,
+                                (enum mpm_fbar_scheme)scheme),
+                       cases[k].goal[scheme > 0]);
+        }
+    }
+    puts("\nOther bases");
+    for (int dim = 2; dim <= 3; dim++) {
+        static const enum mpm_basis bases[] = {MPM_LINEAR, MPM_GIMP, MPM_BSPLINE3};
+        for (int k = 0; k < 3; k++) {
+            struct block b = block_of(dim, 2, dim == 2 ? 1e4 : 1e5, MPM_FBAR_ZHAO);
+            b.basis = bases[k];
+            kernel_row("bases", b, 0);
+        }
+    }
+    puts("\nOther materials");
+    for (int dim = 2; dim <= 3; dim++) {
+        for (int material = WATER; material < N_MATERIALS; material++) {
+            struct block b = block_of(dim, 2, dim == 2 ? 1e4 : 1e5, MPM_FBAR_ZHAO);
+            b.material = material;
+            kernel_row("materials", b, 0);
+        }
+    }
+    if (mpm_isa_in_use(MPM_ISA_AUTO) == MPM_ISA_AVX512) {
+        puts("\nAVX2");
+        for (int k = 0; k < 4; k++) {
+            struct block b = block_of(2 + k / 2, 2, k < 2 ? 1e4 : 1e5,
+                                      k % 2 ? MPM_FBAR_ZHAO : MPM_FBAR_OFF);
+            b.isa = MPM_ISA_AVX2;
+            kernel_row("avx2", b, k < 2 ? 4 : 4.5);
+        }
+    }
+}
+
+// ---- One against another ----
+
+// Median of the rounds' ratios, one / other, per particle and step.
+static double pair(struct block one, struct block other, double *ns) {
+    const int rounds = quick ? 5 : 15;
+    const double turn = quick ? 0.02 : 0.05;
+    struct mpm_sim *a = create(0, one), *b = create(1, other);
+    double ratio[MAX_ROUNDS], first[MAX_ROUNDS];
+    timed(a, turn);
+    timed(b, turn);
+    for (int r = 0; r < rounds; r++) { // who begins takes turns, too
+        double x, y;
+        if (r % 2) {
+            y = timed(b, turn);
+            x = timed(a, turn);
+        } else {
+            x = timed(a, turn);
+            y = timed(b, turn);
+        }
+        ratio[r] = x / y;
+        first[r] = 1e9 * x;
+    }
+    *ns = median(first, rounds);
+    mpm_free(a);
+    mpm_free(b);
+    return median(ratio, rounds);
+}
+
+static void pair_row(const char *group, const char *what, struct block one, struct block other,
+                     double most) {
+    double ns;
+    const double ratio = pair(one, other, &ns);
+    printf("%-66s %7.1f ns  ratio %.3f  %s (at most %.2f)\n", what, ns, ratio,
+           ratio <= most ? "met" : "MISSED", most);
+    fflush(stdout);
+    open_row(group);
+    text("what", what);
+    describe(one, (size_t)one.n);
+    number("ns_per_particle_step", ns);
+    number("ratio", ratio);
+    number("at_most", most);
+    text("verdict", ratio <= most ? "met" : "missed");
+    fprintf(json, "}");
+}
+
+static void ratios(void) {
+    if (!wanted("ratios")) {
+        return;
+    }
+    puts("\nOne against another, in turns");
+    const struct block std2 = block_of(2, 2, 1e4, MPM_FBAR_OFF), std3 = block_of(3, 2, 1e5, MPM_FBAR_OFF);
+    struct block one = std2, other = std2;
+    one.scheme = MPM_FBAR_ZHAO;
+    pair_row("ratios", "zhao / standard, 2D in cache", one, std2, 1.55);
+    other = one;
+    one.scheme = MPM_FBAR_ANCHORED;
+    pair_row("ratios", "anchored / zhao, 2D", one, other, 1.10);
+    one = other = std3;
+    one.scheme = MPM_FBAR_ZHAO;
+    pair_row("ratios", "zhao / standard, 3D", one, other, 1.4);
+    other = one;
+    one.scheme = MPM_FBAR_ANCHORED;
+    pair_row("ratios", "anchored / zhao, 3D", one, other, 1.10);
+    for (int dim = 2; dim <= 3; dim++) {
+        one = other = block_of(dim, 2, dim == 2 ? 1e4 : 1e5, MPM_FBAR_ZHAO);
+        one.basis = MPM_GIMP;
+        pair_row("ratios", dim == 2 ? "uGIMP / B-spline, 2D" : "uGIMP / B-spline, 3D", one, other, 1.05);
+        one = other;
+        one.material = CLAY;
+        pair_row("ratios", dim == 2 ? "Hencky + J2, elastic / neo-Hookean, 2D"
+                                    : "Hencky + J2, elastic / neo-Hookean, 3D", one, other, 1.5);
+        one.material = FLOWING;
+        pair_row("ratios", dim == 2 ? "Hencky + J2, all flowing / neo-Hookean, 2D"
+                                    : "Hencky + J2, all flowing / neo-Hookean, 3D", one, other, 1.5);
+    }
+    puts("\nTwo threads against one (wall time; no machine keeps its clock with both at work)");
+    for (int dim = 2; dim <= 3; dim++) {
+        one = other = block_of(dim, 2, 1e5, MPM_FBAR_ZHAO);
+        one.n_threads = 2;
+        pair_row("threads", dim == 2 ? "two threads / one, 2D, 100k" : "two threads / one, 3D, 100k", one,
+                 other, 0.55);
+    }
+    puts("\nOnly what a scene needs");
+    one = other = std2;
+    one.n_probes = 8;
+    pair_row("features", "probes declared, none due / none declared", one, other, 1.02);
+    one = other;
+    one.fbar_once = true;
+    pair_row("features", "F-bar switched off again / never on", one, other, 1.02);
+    one = other = block_of(2, 2, 1e3, MPM_FBAR_ZHAO);
+    one.room = 1000;
+    pair_row("features", "1,000 particles in 1,000 x 1,000 cells / in a tight domain", one, other, 1.15);
+}
+
+static void sorting(void) {
+    if (!wanted("sort")) {
+        return;
+    }
+    puts("\nSorting: one sort against one step");
+    for (int dim = 2; dim <= 3; dim++) {
+        struct mpm_sim *sim = create(0, block_of(dim, 2, 1e5, MPM_FBAR_ZHAO));
+        double steps[MAX_ROUNDS];
+        const int rounds = quick ? 3 : 9;
+        timed(sim, 0.05);
+        for (int r = 0; r < rounds; r++) {
+            const double step = timed(sim, 0.05) * (double)mpm_n_particles(sim);
+            const double t = now();
+            mpm_sort(sim);
+            steps[r] = (now() - t) / step;
+        }
+        printf("%dD, 100k: a sort that finds all in order takes %.2f steps\n", dim, median(steps, rounds));
+        open_row("sort");
+        number("dimension", dim);
+        number("steps_per_sort", median(steps, rounds));
+        fprintf(json, "}");
+        mpm_free(sim);
+    }
+}
+
+static void growth(void) {
+    if (!wanted("growth")) {
+        return;
+    }
+    puts("\nGrowth: 2D, 4 per cell, B-spline, zhao");
+    for (double n = 1e4; n <= (quick ? 1e6 : 1e7); n *= 10) {
+        struct mpm_sim *sim = create(0, block_of(2, 2, n, MPM_FBAR_ZHAO));
+        double ns[5];
+        timed(sim, 0.05);
+        for (int r = 0; r < 5; r++) {
+            ns[r] = 1e9 * timed(sim, 0.1);
+        }
+        printf("%9zu particles: %.1f ns, %.1f M particle-steps/s, %.0f B a particle\n",
+               mpm_n_particles(sim), median(ns, 5), 1e3 / median(ns, 5), bytes_per_particle(sim));
+        fflush(stdout);
+        open_row("growth");
+        number("particles", (double)mpm_n_particles(sim));
+        number("ns_per_particle_step", median(ns, 5));
+        number("bytes_per_particle", bytes_per_particle(sim));
+        fprintf(json, "}");
+        mpm_free(sim);
+    }
+}
+
+int main(int argc, char **argv) {
+    const char *path = "/dev/null";
+    for (int k = 1; k < argc; k++) {
+        if (strcmp(argv[k], "--quick") == 0) {
+            quick = true;
+        } else if (strcmp(argv[k], "--json") == 0 && k + 1 < argc) {
+            path = argv[++k];
+        } else if (argv[k][0] == '-') {
+            fprintf(stderr, "usage: bench [--quick] [--json FILE] [kernels | ratios | sort | growth]\n");
+            return 2;
+        } else {
+            filter = argv[k];
+        }
+    }
+    json = fopen(path, "w");
+    if (!json) {
+        perror(path);
+        return 1;
+    }
+    fprintf(json, "[");
+    kernels();
+    ratios();
+    sorting();
+    growth();
+    fprintf(json, "\n]\n");
+    return fclose(json) ? 1 : 0;
+}

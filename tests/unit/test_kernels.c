@@ -1,0 +1,246 @@
+// Kernels in lanes against the plain ones, for every combination; and the same bits for any number
+// of threads, with sorts on the way.
+#include <math.h>
+#include <setjmp.h>
+#include <stdarg.h>
+#include <stddef.h>
+#include <stdint.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include <cmocka.h>
+
+#include "server/mpm/sim.h"
+
+#define H 0.125
+enum { RUBBER, FLUID, CLAY, N_KINDS };
+
+static struct {
+    struct mpm_def def;
+    struct mpm_material_def material;
+    struct mpm_body_def body;
+    struct mpm_stage_def stage;
+    struct mpm_wall_def walls[3];
+} world;
+
+static uint64_t seed;
+static double uniform(void) { // [-1, 1)
+    seed = seed * 6364136223846793005 + 1442695040888963407;
+    return (double)(int64_t)seed / 9223372036854775808.0;
+}
+
+static double bulk_modulus(int kind) {
+    const double *par = world.material.parameters;
+    return kind == FLUID ? par[1] : par[1] / (3 * (1 - 2 * par[2]));
+}
+
+// A block in a corner of two walls, of `cells` cells a side.
+static void define(int dim, int basis, int scheme, int kind, int cells, int per_direction) {
+    static const struct mpm_material_def materials[N_KINDS] = {
+        [RUBBER] = {.model = NULL, .parameters = {1000, 1e5, 0.45}},
+        [FLUID] = {.model = NULL, .parameters = {1000, 1e5, 5}},
+        [CLAY] = {.model = NULL, .parameters = {1000, 1e5, 0.45, 300, 100, 10}},
+    };
+    static const char *const models[] = {"neo_hookean", "newtonian", "hencky_j2"};
+    memset(&world, 0, sizeof world);
+    world.def = mpm_def_default();
+    world.material = materials[kind];
+    world.material.name = "material";
+    world.material.model = mpm_material_find(models[kind]);
+    world.material.fbar = true;
+    world.body =
+        (struct mpm_body_def){.name = "block", .particles_per_direction = per_direction};
+    for (int d = 0; d < dim; d++) {
+        world.body.shape.max[d] = cells * H;
+        world.def.domain_min[d] = -H;
+        world.def.domain_max[d] = (2 * cells + 4) * H;
+        world.walls[d] = (struct mpm_wall_def){.name = "wall",
+                                               .axis = d,
+                                               .keeps_above = true,
+                                               .condition = d ? MPM_WALL_SLIP : MPM_WALL_FIXED};
+    }
+    world.stage = (struct mpm_stage_def){.name = "main", .duration = 10};
+    world.def.dimension = dim;
+    world.def.basis = (enum mpm_basis)basis;
+    world.def.cell = H;
+    world.def.settings.cfl = 0.2;
+    world.def.settings.gravity[1] = -10;
+    world.def.settings.damping_local = 0.01;
+    world.def.settings.damping_mass = 0.1;
+    world.def.settings.blend = 0.95;
+    world.def.settings.fbar.scheme = (enum mpm_fbar_scheme)scheme;
+    world.def.wants_volume_ratio = true;
+    world.def.n_materials = world.def.n_bodies = world.def.n_stages = 1;
+    world.def.n_walls = 2;
+    world.def.materials = &world.material;
+    world.def.bodies = &world.body;
+    world.def.stages = &world.stage;
+    world.def.walls = world.walls;
+}
+
+// Places and velocities at random, so that runs, tiles and vectors end anywhere.
+static struct mpm_sim *create(enum mpm_isa isa, int n_threads, double speed) {
+    struct mpm_sim *sim;
+    struct mpm_error err = {0};
+    world.def.isa = isa;
+    world.def.n_threads = n_threads;
+    if (mpm_create(&world.def, &sim, &err)) {
+        fail_msg("%s: %s", err.pointer, err.message);
+    }
+    assert_int_equal(sim->isa, isa);
+    struct mpm_particles *s = &sim->sets[0];
+    const double spacing = H / world.body.particles_per_direction;
+    seed = 11;
+    for (size_t id = 0; id < s->n; id++) {
+        size_t p = 0;
+        while (s->id[p] != id) {
+            p++;
+        }
+        s->V0[p] *= 1 + 0.1 * uniform();
+        s->V[p] = s->V0[p];
+        for (int d = 0; d < s->dim; d++) {
+            s->x[mpm_at(p, s->dim, d)] += 0.45 * spacing * uniform();
+            s->v[mpm_at(p, s->dim, d)] = speed * (d == 0) + 0.2 * uniform();
+        }
+    }
+    sim->c.v2_max = (speed + 1) * (speed + 1);
+    assert_true(mpm_sort(sim));
+    return sim;
+}
+
+static void advance(struct mpm_sim *sim, int n) {
+    for (int k = 0; k < n; k++) {
+        struct mpm_error err = {0};
+        if (mpm_step(sim, &err)) {
+            fail_msg("%s", err.message);
+        }
+    }
+}
+
+static double *field(const struct mpm_sim *sim, enum mpm_field which, size_t *n) {
+    *n = mpm_n_particles(sim) * mpm_field_components(which, sim->grid.dim);
+    double *values = malloc(*n * sizeof *values);
+    mpm_field_copy(sim, which, values);
+    return values;
+}
+
+static void near(const struct mpm_sim *sim, const struct mpm_sim *plain, enum mpm_field which,
+                 double size, const char *what) {
+    size_t n;
+    double *a = field(sim, which, &n), *b = field(plain, which, &n);
+    for (size_t i = 0; i < n; i++) {
+        if (!(fabs(a[i] - b[i]) <= 1e-12 * size)) {
+            fail_msg("%s: %s %zu: %.17g, of the plain kernels %.17g, in units of %g", what,
+                     mpm_field_info(which)->name, i, a[i], b[i], size);
+        }
+    }
+    free(a);
+    free(b);
+}
+
+// Round-off only: positions in units of the body, velocities of the largest, stresses of the bulk
+// modulus. 100 steps of CFL 0.2 are 20 cells of a wave's way; round-off grows little on it.
+static void test_kernels_agree_with_the_plain_ones(void **state) {
+    (void)state;
+    static const char *const kinds[] = {"rubber", "fluid", "clay"};
+    for (int dim = 2; dim <= 3; dim++) {
+        for (int basis = 0; basis < MPM_N_BASES; basis++) {
+            for (int scheme = 0; scheme < MPM_N_FBAR_SCHEMES; scheme++) {
+                for (int kind = 0; kind < N_KINDS; kind++) {
+                    define(dim, basis, scheme, kind, dim == 2 ? 7 : 3, dim == 2 ? 3 : 2);
+                    struct mpm_sim *plain = create(MPM_ISA_BASELINE, 1, 0.5);
+                    advance(plain, 100);
+                    size_t n;
+                    double *v = field(plain, MPM_FIELD_VELOCITY, &n), largest = 0;
+                    for (size_t i = 0; i < n; i++) {
+                        largest = fmax(largest, fabs(v[i]));
+                    }
+                    free(v);
+                    for (int isa = MPM_ISA_AVX2; isa < MPM_N_ISAS; isa++) {
+                        if (!mpm_isa_available((enum mpm_isa)isa)) {
+                            continue;
+                        }
+                        char what[100];
+                        snprintf(what, sizeof what, "%s %dD %s %s %s",
+                                 mpm_isa_name((enum mpm_isa)isa), dim,
+                                 mpm_basis_name((enum mpm_basis)basis),
+                                 mpm_fbar_name((enum mpm_fbar_scheme)scheme), kinds[kind]);
+                        struct mpm_sim *sim = create((enum mpm_isa)isa, 1, 0.5);
+                        advance(sim, 100);
+                        near(sim, plain, MPM_FIELD_POSITION, world.body.shape.max[0], what);
+                        near(sim, plain, MPM_FIELD_VELOCITY, largest, what);
+                        near(sim, plain, MPM_FIELD_STRESS, bulk_modulus(kind), what);
+                        near(sim, plain, MPM_FIELD_VOLUME_RATIO, 1, what);
+                        near(sim, plain, MPM_FIELD_VOLUME_RATIO_BAR, 1, what);
+                        mpm_free(sim);
+                    }
+                    mpm_free(plain);
+                }
+            }
+        }
+    }
+}
+
+// Whole states: all particles in their order, the clock, the tiles.
+static void same(const struct mpm_sim *a, const struct mpm_sim *b) {
+    const size_t bytes = mpm_state_bytes(a);
+    assert_int_equal(bytes, mpm_state_bytes(b));
+    char *one = malloc(bytes), *other = malloc(bytes);
+    mpm_state_save(a, one);
+    mpm_state_save(b, other);
+    assert_memory_equal(one, other, bytes);
+    free(one);
+    free(other);
+}
+
+// Carried along fast enough to change cells many times, so that the sorts come while the threads
+// are at work. Seven threads on any machine: more than cores, so that they come and go.
+static void test_kernels_give_the_same_bits_on_any_number_of_threads(void **state) {
+    (void)state;
+    static const int threads[] = {2, 3, 4, 7};
+    for (int isa = MPM_ISA_BASELINE; isa < MPM_N_ISAS; isa++) {
+        for (int dim = 2; mpm_isa_available((enum mpm_isa)isa) && dim <= 3; dim++) {
+            for (int basis = MPM_GIMP; basis < MPM_N_BASES; basis += 2) {
+                for (int scheme = 0; scheme < MPM_N_FBAR_SCHEMES; scheme++) {
+                    const int kind = (dim + scheme) % N_KINDS;
+                    define(dim, basis, scheme, kind, dim == 2 ? 18 : 9, 2);
+                    struct mpm_sim *one = create((enum mpm_isa)isa, 1, 8);
+                    const uint64_t first_sort = one->c.steps_since_sort;
+                    advance(one, 40);
+                    assert_true(first_sort == 0 && one->c.steps_since_sort < 40);
+                    for (int k = 0; k < 4; k++) {
+                        struct mpm_sim *many = create((enum mpm_isa)isa, threads[k], 8);
+                        advance(many, 40);
+                        same(one, many);
+                        mpm_free(many);
+                    }
+                    mpm_free(one);
+                }
+            }
+        }
+    }
+}
+
+// What AUTO comes to is available; what is not there falls back to it.
+static void test_kernels_are_those_of_the_machine(void **state) {
+    (void)state;
+    assert_true(mpm_isa_available(MPM_ISA_AUTO) && mpm_isa_available(MPM_ISA_BASELINE));
+    const enum mpm_isa best = mpm_isa_in_use(MPM_ISA_AUTO);
+    assert_true(best != MPM_ISA_AUTO && mpm_isa_available(best));
+    for (int isa = MPM_ISA_BASELINE; isa < MPM_N_ISAS; isa++) {
+        const bool there = mpm_isa_available((enum mpm_isa)isa);
+        assert_int_equal(mpm_isa_in_use((enum mpm_isa)isa), there ? isa : (int)best);
+        assert_int_equal(mpm_isa_parse(mpm_isa_name((enum mpm_isa)isa)), isa);
+    }
+}
+
+int main(int argc, char **argv) {
+    const struct CMUnitTest tests[] = {
+        cmocka_unit_test(test_kernels_agree_with_the_plain_ones),
+        cmocka_unit_test(test_kernels_give_the_same_bits_on_any_number_of_threads),
+        cmocka_unit_test(test_kernels_are_those_of_the_machine),
+    };
+    cmocka_set_test_filter(argc > 1 ? argv[1] : NULL);
+    return cmocka_run_group_tests(tests, NULL, NULL);
+}
