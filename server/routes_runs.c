@@ -125,6 +125,8 @@ static cJSON *run_json(struct run *run) {
     for (unsigned k = 0; k < status.n_warnings; k++)
         cJSON_AddItemToArray(warnings, cJSON_CreateString(status.warnings[k]));
     cJSON_AddItemToObject(json, "changes", run_changes(run));
+    cJSON_AddItemToObject(json, "journal", routes_journal_json(run));
+    cJSON_AddItemToObject(json, "recorders", routes_recorders_json(run));
     cJSON_AddItemToObject(json, "performance", performance_json(&status));
     cJSON_AddItemToObject(json, "balance", balance_json(&status));
     cJSON_AddItemToObject(

@@ -14,7 +14,7 @@
 #include "server/log.h"
 #include "server/run_inside.h"
 
-#define WARNING_DISK "waits for room on the disk"
+#define WARNING_ROOM "waits for room "
 #define PUBLISH_SECONDS 0.02 // between two copies of the status
 #define WAITING_SECONDS 0.25 // a shorter wait for the disk is not worth a change of state
 #define CHECKPOINT_FLUSH 5.0 // s to wait for frames on their way before a checkpoint is given up
@@ -126,7 +126,10 @@ static enum run_outcome snapshot(struct run *r, struct run_command *c) {
         return RUN_BUSY;
     }
     if (r->next_seq < r->replay.end || !publish_has_room(r->outlet)) {
-        snprintf(c->why, sizeof c->why, "frames are still on their way to the disk");
+        snprintf(c->why, sizeof c->why, "%s",
+                 journal_held(r->journal)
+                     ? "the journal is full of frames that a recorder has not acknowledged"
+                     : "frames are still on their way to the disk");
         return RUN_BUSY;
     }
     // Idempotent: what is there already of this very step is not taken again.
@@ -242,6 +245,8 @@ static bool end_push(struct run *r) {
             run_checkpoint(r, why);
         run_sample(r);
         series_flush(r->series);
+        if (r->config.output.durability_power)
+            series_sync(r->series);
         run_frame_take(r, ending, true);
         if (r->ending != ending) // no memory for it
             return false;
@@ -270,7 +275,7 @@ static void finish(struct run *r) {
     if (!r->end_pushed || (!publish_flush(r->outlet, 0) && !forced))
         return;
     run_wall_leave(r);
-    run_unwarn(&r->now, WARNING_DISK);
+    run_unwarn(&r->now, WARNING_ROOM);
     run_status_fill(r, r->ending != RUN_FAILED);
     struct run_status last = run_status_until_now(r);
     last.state = r->ending;
@@ -309,20 +314,43 @@ static void wait_for_knock(struct run *r, double seconds) {
     pthread_mutex_unlock(&r->lock);
 }
 
-// A frame is due and the queue to the disk is full.
-static void wait_for_disk(struct run *r) {
-    char why[JOURNAL_WHY];
+// "recorder NAME, silent for 12 s, has acknowledged frame 3 of 80"
+static void explain_held(struct run *r, char *out) {
+    struct recorder slowest;
+    if (recorders_slowest(r->recorders, &slowest))
+        snprintf(out, JOURNAL_WHY,
+                 "recorder %s, silent for %.0f s, has acknowledged %lld of %llu frames",
+                 slowest.name, slowest.heard, (long long)slowest.acked + 1,
+                 (unsigned long long)journal_n_frames(r->journal));
+}
+
+// A frame is due and there is no room: the disk is behind or full, or a recorder is behind.
+static void wait_for_room(struct run *r) {
+    char why[JOURNAL_WHY] = "";
     enum journal_result status = publish_status(r->outlet, why);
+    if (status == JOURNAL_HELD || (status == JOURNAL_OK && journal_held(r->journal))) {
+        status = JOURNAL_HELD;
+        explain_held(r, why);
+    }
     run_wall_wait(r);
     if (status == JOURNAL_ERROR) {
         run_fail(r, "journal", "look at the disk of the data folder", why);
     } else if (status == JOURNAL_FULL && !r->config.output.when_full_block) {
         run_fail(r, "journal", "make room on the disk, or set output.when_full to \"block\"", why);
+    } else if (status == JOURNAL_HELD && !r->config.output.when_full_block) {
+        run_fail(r, "journal",
+                 "record faster, raise output.journal_bytes, or set output.when_full to \"block\"",
+                 why);
     } else {
+        run_unwarn(&r->now, WARNING_ROOM);
         if (status == JOURNAL_FULL)
-            run_warn(&r->now, WARNING_DISK ": %.150s", why);
+            run_warn(&r->now, WARNING_ROOM "on the disk: %.150s", why);
+        else if (status == JOURNAL_HELD)
+            run_warn(&r->now, WARNING_ROOM "in the journal: %.150s", why);
         if (r->now.state == RUN_RUNNING && run_clock() - r->wait_from > WAITING_SECONDS)
             run_state_enter(r, RUN_WAITING);
+        else if (run_clock() - r->last_published >= PUBLISH_SECONDS)
+            run_status_publish(r, false);
         wait_for_knock(r, 0.05);
         run_boundary(r);
     }
@@ -335,10 +363,10 @@ static void advance(struct run *r) {
     if (r->due) {
         run_boundary(r);
         if (r->due) {
-            wait_for_disk(r);
+            wait_for_room(r);
             return;
         }
-        run_unwarn(&r->now, WARNING_DISK);
+        run_unwarn(&r->now, WARNING_ROOM);
     }
     if (r->now.state == RUN_WAITING)
         run_state_enter(r, RUN_RUNNING);
@@ -397,7 +425,7 @@ static void turn(struct run *r) {
             if (r->due && r->sim != NULL)
                 run_boundary(r);
             if (!r->due)
-                run_unwarn(&r->now, WARNING_DISK);
+                run_unwarn(&r->now, WARNING_ROOM);
             wait_for_knock(r, r->due ? 0.2 : 60);
         }
         break;

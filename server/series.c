@@ -286,6 +286,10 @@ int series_flush(struct series *s) {
     return error;
 }
 
+int series_sync(struct series *s) {
+    return s->fd >= 0 && fdatasync(s->fd) != 0 ? errno : 0;
+}
+
 size_t series_unsaved(struct series *s) {
     pthread_mutex_lock(&s->lock);
     size_t n = s->n_rows - s->n_saved;

@@ -41,6 +41,7 @@ enum series_verdict series_append(struct series *series, uint64_t step, double t
                                   const double *values);
 // Writes to the log what has been appended since; 0 or errno.
 int series_flush(struct series *series);
+int series_sync(struct series *series); // what was flushed survives a power failure; 0 or errno
 size_t series_unsaved(struct series *series); // rows
 
 size_t series_n_rows(struct series *series);
