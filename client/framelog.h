@@ -41,10 +41,17 @@ int framelog_read(struct framelog *log, struct framelog_record *out, uint64_t *c
                   size_t why_bytes);
 void framelog_rewind(struct framelog *log);
 
+// The same without reading what is long: of a frame, `payload` is its preamble and header only
+// (`bytes` counts these). Gives the records that framelog_read has found good or that were appended
+// here, and no others.
+int framelog_skim(struct framelog *log, struct framelog_record *out, char *why, size_t why_bytes);
+
 // Appends at the end; only after everything has been read. A failed append leaves the log as it
 // was.
 int framelog_append(struct framelog *log, enum framelog_kind kind, const void *payload,
                     size_t bytes, char *why, size_t why_bytes);
-// On return 0 all that was appended survives a power failure.
+// On return 0 all that was appended survives a power failure. Otherwise what is not known to be on
+// the disk is cut off, since nobody can tell any more what would be there after such a failure: the
+// next recording asks for it again.
 int framelog_sync(struct framelog *log, char *why, size_t why_bytes);
 uint64_t framelog_bytes(const struct framelog *log);
