@@ -51,6 +51,20 @@ static uint64_t head_digest(const struct head *head) {
     return XXH3_64bits(head, offsetof(struct head, own));
 }
 
+// Of a frame, its preamble stands for all of it: the frame's own digest is in there.
+static uint64_t payload_digest(enum framelog_kind kind, const void *payload, size_t bytes) {
+    const bool frame = kind == FRAMELOG_FRAME && bytes > FRAME_PREAMBLE;
+    return XXH3_64bits(payload, frame ? FRAME_PREAMBLE : bytes);
+}
+
+static bool payload_whole(const struct head *head, const void *payload) {
+    struct frame_view view;
+    char why[128];
+    return payload_digest((enum framelog_kind)head->kind, payload, head->bytes) == head->digest &&
+           (head->kind != FRAMELOG_FRAME ||
+            frame_open(payload, head->bytes, &view, why, sizeof why) == 0);
+}
+
 static bool head_valid(const struct head *head) {
     return memcmp(head->magic, MAGIC, 8) == 0 && head->own == head_digest(head) &&
            head->zeros == 0 && head->bytes <= (uint64_t)INT64_MAX / 2;
@@ -194,7 +208,7 @@ int framelog_read(struct framelog *log, struct framelog_record *out, uint64_t *c
     const int got = read_at(log->fd, log->payload, head.bytes, log->cursor + HEAD);
     if (got < 0)
         return fail_errno(log, why, why_bytes);
-    if (got == 0 || XXH3_64bits(log->payload, head.bytes) != head.digest ||
+    if (got == 0 || !payload_whole(&head, log->payload) ||
         log->cursor + HEAD + padded(head.bytes) > size)
         return end_of_log(log, size, cut, why, why_bytes);
     log->cursor += HEAD + padded(head.bytes);
@@ -243,7 +257,7 @@ int framelog_append(struct framelog *log, enum framelog_kind kind, const void *p
     static const unsigned char zeros[HEAD];
     struct head head = {.kind = kind,
                         .bytes = bytes,
-                        .digest = XXH3_64bits(payload, bytes),
+                        .digest = payload_digest(kind, payload, bytes),
                         .durable = log->durable,
                         .previous = log->previous};
     memcpy(head.magic, MAGIC, 8);

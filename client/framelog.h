@@ -2,11 +2,11 @@
 // complete.
 //
 // HDF5 1.10 does not survive a killed writer; this does. A record is a 64-byte head and a payload
-// padded to 64: magic "FBARREC1", u32 kind, u32 0, u64 payload bytes, u64 XXH3-64 of the payload,
-// u64 durable, u64 digest of the head before, u64 XXH3-64 of all these, zeros. `durable` is the
-// length of the log that was known to be on disk when the record was appended: damage beyond every
-// such length can only be a torn tail and is cut; damage below one is reported with its place and
-// nothing is touched.
+// padded to 64: magic "FBARREC1", u32 kind, u32 0, u64 payload bytes, u64 XXH3-64 of the payload
+// (of a frame: of its preamble, which holds the digest of the rest), u64 durable, u64 digest of the
+// head before, u64 XXH3-64 of all these, zeros. `durable` is the length of the log that was known
+// to be on disk when the record was appended: damage beyond every such length can only be a torn
+// tail and is cut; damage below one is reported with its place and nothing is touched.
 #pragma once
 #include <stdbool.h>
 #include <stddef.h>

@@ -139,7 +139,7 @@ enum recorder_outcome recorder_resume_log(struct recorder *r, bool *empty) {
             r->complete = true;
             break;
         case FRAMELOG_FRAME:
-            if (frameinfo_read(record.payload, record.bytes, &info, r->why, sizeof r->why) != 0 ||
+            if (frameinfo_peek(record.payload, record.bytes, &info, r->why, sizeof r->why) != 0 ||
                 info.seq != r->next) {
                 snprintf(r->why, sizeof r->why, "%s: the frames in it are not in order",
                          r->log_name);

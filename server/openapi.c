@@ -78,7 +78,9 @@ static const struct {
      "ies\":{\"scene\":{\"type\":[\"string\",\"object\"],\"description\":\"name of a built-i"
      "n scene, or a scene\"},\"overrides\":{\"type\":\"object\",\"description\":\"merge patc"
      "h (RFC 7396) on the scene\"},\"id\":{\"type\":\"string\",\"pattern\":\"^[A-Za-z0-9][A-"
-     "Za-z0-9._-]{0,63}$\"},\"start\":{\"type\":\"boolean\",\"default\":true},\"wait_subscri"
+     "Za-z0-9._-]{0,63}$\"},\"recorders\":{\"type\":\"array\",\"items\":{\"type\":\"string\"},"
+     "\"maxItems\":64},"
+     "\"start\":{\"type\":\"boolean\",\"default\":true},\"wait_subscri"
      "bers\":{\"type\":\"integer\",\"const\":0}}}"},
     {"State",
      "{\"enum\":[\"queued\",\"running\",\"waiting\",\"paused\",\"completed\",\"failed\",\"ca"

@@ -372,6 +372,8 @@ struct run *run_create(const struct run_host *host, const struct run_definition 
     bool made = r->recorders != NULL &&
                 journal_power(r->journal, r->config.output.durability_power, why) == JOURNAL_OK &&
                 journal_append_event(r->journal, event, why) == JOURNAL_OK;
+    for (size_t k = 0; made && k < definition->n_recorders; k++)
+        made = recorders_put(r->recorders, definition->recorders[k], -1, why) == RECORDERS_OK;
     if (made && definition->start) // here and not in its thread, so that first come is first served
         slots_ask(host->slots, &r->slot, r->sim_bytes);
     if (!made || !begin_thread(r)) {

@@ -121,6 +121,8 @@ struct run_definition {
     const char *name;    // of the scene: a built-in's name, or the inline scene's title
     struct scene *scene; // valid; the run owns it once it is created
     bool start;
+    const char *recorders[RECORDERS_MAX]; // registered before its first frame
+    size_t n_recorders;
 };
 // A new run with its folder and its thread. NULL with a sentence in `why`; then the scene is still
 // the caller's.
