@@ -373,6 +373,10 @@ static enum recorder_outcome start(struct recorder *r) {
     enum recorder_outcome outcome = recorder_connect(r);
     if (outcome == RECORDER_GOOD)
         outcome = recorder_get_json(r, "", &run);
+    // A recording that goes on waits as it would have done had it never stopped.
+    while (!empty && outcome == RECORDER_AWAY && !interrupt_count() &&
+           wait_for_daemon(r) == RECORDER_GOOD)
+        outcome = recorder_get_json(r, "", &run);
     if (outcome != RECORDER_GOOD) {
         if (outcome == RECORDER_AWAY)
             terminal_error("cannot reach the daemon at %s: %s", r->client->url, r->why);
