@@ -233,8 +233,9 @@ static enum recorder_outcome turn(struct recorder *r) {
     enum recorder_outcome outcome = RECORDER_GOOD;
     enum subscribe_kind kind = SUBSCRIBE_NOTHING;
     const bool unsynced = r->synced_frames != r->next;
+    const int patience_ms = r->heard_at == 0 ? 0 : unsynced ? 5 : 100;
     if (r->subscription)
-        kind = subscribe_receive(r->subscription, unsynced ? 5 : 100, &body, &bytes);
+        kind = subscribe_receive(r->subscription, patience_ms, &body, &bytes);
     else
         usleep(100000);
     if (kind == SUBSCRIBE_FRAME) {

@@ -119,6 +119,12 @@ static herr_t deepest(unsigned n, const H5E_error2_t *error, void *context) {
     return 0;
 }
 
+void store_begin(void) {
+    // HDF5 1.10 crashes at the process's exit over a file that it could not close for want of room.
+    H5dont_atexit();
+    H5Eset_auto2(H5E_DEFAULT, NULL, NULL);
+}
+
 int store_fail(const char *path, char *why, size_t why_bytes) {
     char reason[256] = "HDF5 failed";
     H5Ewalk2(H5E_DEFAULT, H5E_WALK_UPWARD, deepest, reason);
@@ -372,7 +378,7 @@ static int make_arrays(struct store *s, int compress) {
 
 struct store *store_create(const char *path, const struct store_plan *plan,
                            const struct store_about *about, char *why, size_t why_bytes) {
-    H5Eset_auto2(H5E_DEFAULT, NULL, NULL);
+    store_begin();
     struct store *s = calloc(1, sizeof *s);
     const size_t n = plan->n_frames + 1; // never calloc(0)
     if (!s || !(s->path = strdup(path)) || !(s->seq = calloc(n, 8)) || !(s->step = calloc(n, 8)) ||

@@ -150,7 +150,7 @@ static int get_contents(struct store_file *f) {
 }
 
 struct store_file *store_open(const char *path, bool *foreign, char *why, size_t why_bytes) {
-    H5Eset_auto2(H5E_DEFAULT, NULL, NULL);
+    store_begin();
     *foreign = false;
     if (access(path, R_OK) != 0) {
         snprintf(why, why_bytes, "%s: %s", path, strerror(errno));

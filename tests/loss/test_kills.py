@@ -28,7 +28,7 @@ SOLID = merged(POOL, {
     "bodies": {"pool": {"material": "rubber", "particles_per_cell": 8, "velocity": [0, 0, 0],
                         "shape": {"box": {"min": [0, 0, 0.5], "max": [0.5, 0.5, 1]}}}},
     "walls": {"left": None, "right": None, "floor": {"axis": "z", "at": 0}},
-    "probes": {"middle": None, "front": None, "drift": {"kind": "drift"}}, "time": {"end": 2}})  # fmt: skip
+    "probes": {"middle": None, "front": None, "drift": {"kind": "drift"}}, "time": {"end": 8}})  # fmt: skip
 
 SCENES = {"pool": (POOL, SWITCHES), "staged": (STAGED, SWITCHES[:1]), "metal": (METAL, []), "solid": (SOLID, [])}
 
