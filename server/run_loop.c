@@ -226,16 +226,48 @@ static void obey(struct run *r) {
 
 // ---- The end ----------------------------------------------------------------------------------
 
+// Also while a recorder holds the budget: at the end of a run that is no obstacle.
 static bool journal_works(struct run *r) {
     char why[JOURNAL_WHY];
-    return publish_status(r->outlet, why) == JOURNAL_OK;
+    enum journal_result status = publish_status(r->outlet, why);
+    return status == JOURNAL_OK || status == JOURNAL_HELD;
+}
+
+// The probes are in their log before the run is over. Where the disk has no room that is waited for
+// (but not by an end by force); another fault is the run's.
+static bool probes_safe(struct run *r) {
+    int error = series_flush(r->series);
+    if (error == 0 && r->config.output.durability_power)
+        error = series_sync(r->series);
+    if (error == 0 || r->ending != RUN_COMPLETED)
+        return true;
+    bool full = error == ENOSPC || error == EDQUOT;
+    if (!full || !r->config.output.when_full_block) {
+        char why[JOURNAL_WHY];
+        snprintf(why, sizeof why, "the probes' log cannot be written: %s", strerror(error));
+        run_fail(r, "journal", "look at the disk of the data folder", why);
+    } else {
+        run_unwarn(&r->now, WARNING_ROOM);
+        run_warn(&r->now, WARNING_ROOM "on the disk: the probes' log cannot be written");
+    }
+    return false;
 }
 
 // Takes the last frame. False when it has to wait for the disk.
 static bool end_push(struct run *r) {
     char why[JOURNAL_WHY];
-    if (!journal_works(r))
-        return r->ending != RUN_COMPLETED; // an end by force does not wait for the disk
+    enum journal_result status = publish_status(r->outlet, why);
+    if (!journal_works(r) && r->ending != RUN_COMPLETED)
+        return true; // an end by force does not wait for the disk
+    if (status == JOURNAL_ERROR || (status == JOURNAL_FULL && !r->config.output.when_full_block)) {
+        run_fail(r, "journal", "look at the disk of the data folder", why);
+        return false;
+    }
+    run_unwarn(&r->now, WARNING_ROOM);
+    if (status == JOURNAL_FULL)
+        run_warn(&r->now, WARNING_ROOM "on the disk: %.150s", why);
+    if (status != JOURNAL_OK)
+        return false;
     bool from_sim = r->sim != NULL && r->ending != RUN_FAILED;
     if (!publish_has_room(r->outlet) || (!from_sim && !publish_flush(r->outlet, 0)))
         return false;
@@ -244,9 +276,8 @@ static bool end_push(struct run *r) {
         if (ending == RUN_CANCELLED)
             run_checkpoint(r, why);
         run_sample(r);
-        series_flush(r->series);
-        if (r->config.output.durability_power)
-            series_sync(r->series);
+        if (!probes_safe(r))
+            return false;
         run_frame_take(r, ending, true);
         if (r->ending != ending) // no memory for it
             return false;
@@ -400,6 +431,8 @@ static void turn(struct run *r) {
         finish(r);
         if (!run_state_is_final(r->now.state)) {
             run_wall_wait(r);
+            if (r->now.state == RUN_RUNNING && run_clock() - r->wait_from > WAITING_SECONDS)
+                run_state_enter(r, RUN_WAITING);
             wait_for_knock(r, 0.05);
         }
         return;

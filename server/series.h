@@ -30,7 +30,7 @@ size_t series_n_columns(const struct series *series);
 const struct series_probe *series_probe(const struct series *series, size_t index);
 
 // The log: a new file, or an existing one whose torn tail is cut. 0, or -1 with a sentence in `why`
-// (JOURNAL_WHY bytes).
+// (JOURNAL_WHY bytes); a new file that cannot be begun now is tried again by series_flush.
 int series_save_as(struct series *series, const char *path, char *why);
 struct series *series_load(const char *path, char *why);
 

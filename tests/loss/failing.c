@@ -54,7 +54,7 @@ static bool fd_is_under(int fd) {
 static void tell(const char *name) {
     const char *file = getenv("FAIL_TELL");
     char text[64];
-    int n = snprintf(text, sizeof text, "%ld %s\n", calls, name), fd;
+    int n = snprintf(text, sizeof text, "%-12ld %-16s\n", calls, name), fd;
     if (!file || (fd = REAL(open)(file, O_WRONLY | O_CREAT | O_CLOEXEC, 0600)) < 0)
         return;
     if (REAL(pwrite)(fd, text, (size_t)n, 0) != n)
