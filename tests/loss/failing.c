@@ -1,5 +1,5 @@
-// Preloaded into fbard or fbar: the n-th call that changes something under a folder fails, as a full
-// or dying disk makes it fail. What is asked of it stands in the environment:
+// Preloaded into fbard or fbar: the n-th call that changes something under a folder fails, as a
+// full or dying disk makes it fail. What is asked of it stands in the environment:
 //   FAIL_UNDER  the folder, absolute; calls on anything else pass and are not counted
 //   FAIL_AT     n, from 1; 0 only counts
 //   FAIL_ERRNO  a number of errno.h
@@ -23,7 +23,7 @@ static pthread_mutex_t lock = PTHREAD_MUTEX_INITIALIZER;
 static long calls;
 static bool armed; // the half that "short" has still to fail
 
-#define REAL(name) ((__typeof__(&name))dlsym(RTLD_NEXT, #name))
+#define REAL(name) (__extension__(__typeof__(&name)) dlsym(RTLD_NEXT, #name))
 
 static bool is_under(const char *path) {
     const char *folder = getenv("FAIL_UNDER");
@@ -99,13 +99,12 @@ static int verdict(const char *name, bool can_be_short, bool gives_room) {
         return half;                                                                               \
     }
 
-ssize_t write(int fd, const void *from, size_t n) {
-    WRITING("write", fd, n, REAL(write)(fd, from, n), REAL(write)(fd, from, n / 2))
-}
-ssize_t pwrite(int fd, const void *from, size_t n, off_t at) {
-    WRITING("pwrite", fd, n, REAL(pwrite)(fd, from, n, at), REAL(pwrite)(fd, from, n / 2, at))
-}
-ssize_t pwrite64(int fd, const void *from, size_t n, off64_t at) {
+ssize_t write(int fd, const void *from, size_t n){
+    WRITING("write", fd, n, REAL(write)(fd, from, n), REAL(write)(fd, from, n / 2))} ssize_t
+    pwrite(int fd, const void *from, size_t n,
+           off_t at){WRITING("pwrite", fd, n, REAL(pwrite)(fd, from, n, at),
+                             REAL(pwrite)(fd, from, n / 2, at))} ssize_t
+    pwrite64(int fd, const void *from, size_t n, off64_t at) {
     WRITING("pwrite", fd, n, REAL(pwrite64)(fd, from, n, at), REAL(pwrite64)(fd, from, n / 2, at))
 }
 // Half of a vector: a part of what its first non-empty piece holds.
@@ -115,10 +114,10 @@ static ssize_t half_vector(int fd, const struct iovec *parts, int n, off_t at) {
             return REAL(pwrite)(fd, parts[k].iov_base, parts[k].iov_len / 2, at);
     return 0;
 }
-ssize_t pwritev(int fd, const struct iovec *parts, int n, off_t at) {
-    WRITING("pwritev", fd, 2, REAL(pwritev)(fd, parts, n, at), half_vector(fd, parts, n, at))
-}
-ssize_t pwritev64(int fd, const struct iovec *parts, int n, off64_t at) {
+ssize_t pwritev(int fd, const struct iovec *parts, int n,
+                off_t at){WRITING("pwritev", fd, 2, REAL(pwritev)(fd, parts, n, at),
+                                  half_vector(fd, parts, n, at))} ssize_t
+    pwritev64(int fd, const struct iovec *parts, int n, off64_t at) {
     WRITING("pwritev", fd, 2, REAL(pwritev64)(fd, parts, n, at), half_vector(fd, parts, n, at))
 }
 
