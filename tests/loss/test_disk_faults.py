@@ -5,6 +5,7 @@ import errno
 import os
 import pathlib
 import shutil
+import subprocess
 import time
 
 import fbard
@@ -322,6 +323,30 @@ def test_data_folder_that_vanishes_fails_the_run_and_not_the_daemon(place):
     daemon.wait_step("other", step + 20)
     daemon.away("other")
     daemon.stop()
+
+
+def test_recorder_on_a_full_disk_goes_on_when_there_is_room(finished):
+    """A real one: a tmpfs of 24 kB. What was acknowledged is in the log, and the same command goes on."""
+    daemon, frames, wanted = finished
+    out = daemon.folder / "small"
+    out.mkdir()
+    if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=24k", "tmpfs", out], capture_output=True).returncode:
+        pytest.skip("cannot mount a small tmpfs here")
+    try:
+        result = daemon.fbar("record", "run", "-o", "small/a.h5")
+        assert result.returncode == 4 and "No space left on device" in result.stderr, result
+        (recorder,) = daemon.run("run")["recorders"]
+        log = (out / "a.h5.log").read_bytes()
+        assert recorder["acked"] < len(frames) - 1 and frames[0] in log
+        assert all(frame in log for frame in frames[: recorder["acked"] + 1])
+        subprocess.run(["mount", "-o", "remount,size=100k", out], check=True)
+        result = daemon.fbar("record", "run", "-o", "small/a.h5")  # room for the log, but not for the file
+        assert result.returncode == 4 and "nothing is lost" in result.stderr, result
+        subprocess.run(["mount", "-o", "remount,size=10m", out], check=True)
+        assert daemon.fbar("record", "run", "-o", "small/a.h5").returncode == 0
+        check_same_recording(out / "a.h5", wanted)
+    finally:
+        subprocess.run(["umount", "-l", out])
 
 
 def test_shim_is_there():
