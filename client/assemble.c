@@ -17,6 +17,7 @@
 
 #include "client/framelog.h"
 #include "client/probeunits.h"
+#include "client/readahead.h"
 #include "client/store.h"
 #include "client/xdmf.h"
 
@@ -128,23 +129,26 @@ static int write_frames(struct framelog *log, struct store *store, size_t n, cha
                         size_t why_bytes) {
     struct framelog_record record;
     struct frameinfo info;
-    uint64_t cut;
-    framelog_rewind(log);
-    while (n > 0) {
-        const int got = framelog_read(log, &record, &cut, why, why_bytes);
+    struct readahead *ahead = readahead_open(log);
+    int status = ahead ? 0 : -1;
+    if (!ahead)
+        snprintf(why, why_bytes, "out of memory");
+    while (status == 0 && n > 0) {
+        const int got = readahead_next(ahead, &record, why, why_bytes);
         if (got == 0)
             snprintf(why, why_bytes, "the log became shorter while it was read");
         if (got != 1)
-            return -1;
-        if (record.kind != FRAMELOG_FRAME)
+            status = -1;
+        if (status != 0 || record.kind != FRAMELOG_FRAME)
             continue;
         // The record's digest, checked just now, covers the frame.
         if (frameinfo_peek(record.payload, record.bytes, &info, why, why_bytes) != 0 ||
             store_add_frame(store, &info, record.payload, why, why_bytes) != 0)
-            return -1;
+            status = -1;
         n--;
     }
-    return 0;
+    readahead_close(ahead);
+    return status;
 }
 
 // ---- Probes: the daemon's CSV -----------------------------------------------------------------

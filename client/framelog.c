@@ -124,6 +124,15 @@ void framelog_rewind(struct framelog *log) {
     log->cursor = log->cursor_previous = 0;
 }
 
+void framelog_swap(struct framelog *log, unsigned char **buffer, size_t *capacity) {
+    unsigned char *payload = log->payload;
+    const size_t bytes = log->capacity;
+    log->payload = *buffer;
+    log->capacity = *capacity;
+    *buffer = payload;
+    *capacity = bytes;
+}
+
 // Whether a record after `from` was appended when the place `from` was already known to be on disk.
 static int durable_beyond(struct framelog *log, uint64_t from, uint64_t size, bool *out) {
     unsigned char *block = malloc(SCAN_BYTES);

@@ -40,6 +40,9 @@ void framelog_close(struct framelog *log);
 int framelog_read(struct framelog *log, struct framelog_record *out, uint64_t *cut, char *why,
                   size_t why_bytes);
 void framelog_rewind(struct framelog *log);
+// Exchanges the buffer that holds the payload of the last read with one of the caller's (from
+// malloc, or NULL), which keeps the payload.
+void framelog_swap(struct framelog *log, unsigned char **buffer, size_t *capacity);
 
 // The same without reading what is long: of a frame, `payload` is its preamble and header only
 // (`bytes` counts these). Gives the records that framelog_read has found good or that were appended

@@ -1,5 +1,6 @@
 """A recorder that does not keep up holds the run back, or fails it, and loses nothing; a viewer that does
 not keep up costs neither the run nor the daemon anything."""
+import json
 import re
 import signal
 import time
@@ -8,7 +9,7 @@ import pytest
 import zmq
 from boxes import merged, water
 from fbard import until
-from harness import check_same_recording
+from harness import check_same_recording, contents
 
 BUDGET = 1_000_000
 # 10 kB a frame, 600 frames: six times the budget.
@@ -150,6 +151,18 @@ def test_stopped_recorder_holds_the_run_until_it_goes_on(place):
     assert daemon.run("run")["state"] == "completed"
     for file in ("a.h5", "b.h5"):
         check_same_recording(daemon.folder / file, wide.folder / "a.h5")
+
+
+def test_fbar_run_is_registered_before_the_first_frame(daemon):
+    """Six times the budget goes through the journal, and the recording misses nothing."""
+    (daemon.folder / "pool.json").write_text(json.dumps(POOL))
+    result = daemon.fbar("run", "pool.json", "--id", "run", "-o", "a.h5")
+    assert result.returncode == 0, result.stderr
+    frames = index(daemon)
+    assert frames["first"] > 0, "nothing had to go: this shows nothing"
+    _, n = contents(daemon.folder / "a.h5")
+    assert n == frames["frames"][-1]["seq"] + 1 == 601
+    assert daemon.run("run")["recorders"] == []
 
 
 def test_registration_is_checked(daemon):

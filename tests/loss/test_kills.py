@@ -13,7 +13,7 @@ STAGED = merged(POOL, {
     "stages": [{"name": "settle", "duration": 0.4, "damping": {"local": 0.5}},
                {"name": "flow", "remove": {"walls": ["gate"]}}],
     "walls": {"gate": {"axis": "x", "at": 1, "keeps": "below", "condition": "slip"}},
-    "time": {"end": 4}})  # fmt: skip
+    "time": {"end": 4}, "output": {"durability": "power"}})  # fmt: skip
 
 METAL = merged(POOL, {
     "materials": {"water": None, "metal": {"model": "hencky_j2", "density": 2000, "youngs_modulus": 2e6,
