@@ -165,29 +165,6 @@ def test_fbar_run_is_registered_before_the_first_frame(daemon):
     assert daemon.run("run")["recorders"] == []
 
 
-def test_registration_is_checked(daemon):
-    daemon.create(POOL, id="run", start=False)
-    until(lambda: index(daemon)["frames"])
-    path = "/v1/runs/run/recorders/"
-    for body, pointer in (({}, "/acked"), ({"acked": "0"}, "/acked"), ({"acked": -2}, "/acked"),
-                          ({"acked": 0.5}, "/acked"), ({"acked": 1}, "/acked"), ({"acked": 1e300}, "/acked"),
-                          ({"acked": 0, "name": "x"}, "/name")):  # fmt: skip
-        reply = daemon.ask("PUT", path + "a", body, status=422)
-        assert reply.pointers == [pointer], reply
-        assert reply.fault(pointer)["expected"]
-    for name in ("%20", "-a", "a" * 65, "a:b"):
-        assert daemon.request("PUT", path + name, {"acked": -1}).status in (404, 422)
-    assert index(daemon) and daemon.get("/v1/runs/run/recorders") == {"recorders": []}
-    assert put(daemon, "a", -1)["acked"] == -1
-    reply = put(daemon, "a", 0)
-    assert (reply["acked"], reply["lag_frames"], reply["lag_bytes"], reply["first"]) == (0, 0, 0, 0)
-    reply = put(daemon, "a", -1)
-    assert reply["lag_frames"] == 1 and reply["lag_bytes"] == index(daemon)["frames"][0]["bytes"]
-    daemon.ask("PUT", "/v1/runs/none/recorders/a", {"acked": -1}, status=404)
-    for bad in ("x", ["a b"], [1], ["a"] * 65):
-        assert daemon.ask("POST", "/v1/runs", {"scene": POOL, "recorders": bad}, status=422).pointers == ["/recorders"]
-
-
 def resident(daemon, kind):
     with open(f"/proc/{daemon.process.pid}/status") as f:
         return 1024 * int(re.search(rf"{kind}:\s+(\d+)", f.read())[1])
