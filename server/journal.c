@@ -368,9 +368,13 @@ enum journal_result journal_power(struct journal *j, bool on, char *why) {
         return JOURNAL_OK;
     }
     // What is there already, then the names: the run's folder, the one it is in, the data folder.
+    // The flag comes first, so that no frame that is appended meanwhile falls between.
+    j->power = true;
     int error = fdatasync(j->events) != 0 ? errno : 0;
+    pthread_mutex_lock(&j->lock); // the appending thread may go on to another segment
     if (error == 0 && j->tail >= 0 && fdatasync(j->tail) != 0)
         error = errno;
+    pthread_mutex_unlock(&j->lock);
     for (size_t k = 0; k < sizeof files / sizeof *files && error == 0; k++) {
         journal_path(j, files[k], path, PATH_MAX);
         error = sync_file(path);
@@ -379,8 +383,8 @@ enum journal_result journal_power(struct journal *j, bool on, char *why) {
         snprintf(path, sizeof path, "%s%s", j->folder, above[k]);
         error = journal_sync_folder(path);
     }
-    if (error != 0)
-        return journal_failure(error, j->folder, why);
-    j->power = true;
-    return JOURNAL_OK;
+    if (error == 0)
+        return JOURNAL_OK;
+    j->power = false;
+    return journal_failure(error, j->folder, why);
 }

@@ -3,6 +3,7 @@
 #include <errno.h>
 #include <limits.h>
 #include <pthread.h>
+#include <stdatomic.h>
 #include <string.h>
 #include <xxhash.h>
 
@@ -22,7 +23,7 @@ struct journal {
     int events; // descriptors
     int tail;   // the last segment, -1 before the first frame
     uint64_t cut_bytes;
-    bool power;           // every entry is fsynced before it counts
+    atomic_bool power;    // every entry is fsynced before it counts
     uint64_t event_bytes; // of whole lines; only the run's thread appends
     uint64_t event_check; // of the last line
     pthread_mutex_t lock; // over what follows

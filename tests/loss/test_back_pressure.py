@@ -154,6 +154,22 @@ def test_stopped_recorder_holds_the_run_until_it_goes_on(place):
         check_same_recording(daemon.folder / file, wide.folder / "a.h5")
 
 
+def test_durability_and_budget_change_while_it_runs(daemon):
+    scene = merged(POOL, {"time": {"end": 2}, "output": {"journal_bytes": 10**8}})
+    daemon.create(scene, id="run", recorders=["slow"])
+    for k in range(10):
+        step = daemon.run("run")["step"]
+        daemon.patch("run", {"output": {"durability": ("power", "process")[k % 2]}})
+        daemon.wait_step("run", step + 20)
+    daemon.patch("run", {"output": {"journal_bytes": BUDGET}})  # what is there already stays
+    run = daemon.wait("run", "waiting")
+    frames = index(daemon)
+    assert frames["first"] == 0 and run["warnings"] and run["epoch"] == 0
+    daemon.patch("run", {"output": {"journal_bytes": 10**8}})
+    daemon.wait("run", "completed")
+    assert index(daemon)["first"] == 0
+
+
 def test_fbar_run_is_registered_before_the_first_frame(daemon):
     """Six times the budget goes through the journal, and the recording misses nothing."""
     (daemon.folder / "pool.json").write_text(json.dumps(POOL))
