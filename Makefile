@@ -68,7 +68,7 @@ $(B)/obj/server/mpm/kernels.o: ALL_CFLAGS += $(if $(LEVELS),-DMPM_HAS_LANES)
 $(call levels,$(LANES_SRC)): ALL_CFLAGS += -O2 -fno-tree-vectorize -fno-tree-slp-vectorize
 
 .PHONY: all programs deps deps-long libmpm demo check check-all check-layers check-unit check-physics check-api \
-	check-cli check-asan check-clang check-long install uninstall format clean help
+	check-cli check-loss check-asan check-clang check-long bench-recording install uninstall format clean help
 .DELETE_ON_ERROR:
 .SECONDARY:
 
@@ -157,10 +157,10 @@ check: deps ## build and run all tests (installs what is missing)
 	@$(MAKE) --no-print-directory check-all
 
 # The test programs, built but not run: in parallel, where the tests themselves run one by one.
-programs: $(UNIT) $(PHYSICS)
+programs: $(UNIT) $(PHYSICS) $(B)/tests/failing.so
 
 check-all: all
-	$(Q)$(MAKE) --no-print-directory check-layers check-unit check-physics check-api check-cli
+	$(Q)$(MAKE) --no-print-directory check-layers check-unit check-physics check-api check-cli check-loss
 	$(Q)$(MAKE) --no-print-directory check-asan
 
 check-layers: all
@@ -180,6 +180,15 @@ check-api: all ## black-box tests of the daemon
 check-cli: all ## black-box tests of the client
 	$(Q)FBARD=$(CURDIR)/$(B)/fbard FBAR=$(CURDIR)/$(B)/fbar $(PYTEST) tests/cli
 
+# Preloaded by tests of check-loss: calls on the disk that fail.
+$(B)/tests/failing.so: tests/loss/failing.c
+	$(call say,LD,$@)
+	@mkdir -p $(@D)
+	$(Q)$(CC) -std=c17 -D_GNU_SOURCE $(WARN) -O1 -g -shared -fPIC -Wno-missing-prototypes $< -o $@ -ldl
+
+check-loss: all $(B)/tests/failing.so ## kills, failing disks, recorders that stall: nothing is lost
+	$(Q)FBARD=$(CURDIR)/$(B)/fbard FBAR=$(CURDIR)/$(B)/fbar FAILING=$(CURDIR)/$(B)/tests/failing.so $(PYTEST) -s tests/loss
+
 # The same unit and API tests under AddressSanitizer and UBSan.
 check-asan:
 	$(Q)$(MAKE) --no-print-directory -j$$(nproc) VARIANT=asan build/asan/fbard build/asan/fbar programs
@@ -192,6 +201,9 @@ check-clang: ## warnings and unit tests with clang 14
 
 check-long: deps-long ## the longer verification: minutes to hours
 	@FBARD_LONG=1 $(MAKE) --no-print-directory check-all check-clang
+
+bench-recording: all ## what journal and recording cost a run, and how fast fbar records
+	$(Q)FBARD=$(CURDIR)/$(B)/fbard FBAR=$(CURDIR)/$(B)/fbar $(PYTHON) bench/recording.py
 
 ## ---- Use ----
 

@@ -17,6 +17,7 @@
 
 #include "client/framelog.h"
 #include "client/probeunits.h"
+#include "client/readahead.h"
 #include "client/store.h"
 #include "client/xdmf.h"
 
@@ -67,7 +68,7 @@ static int keep_frame(struct contents *c, const struct framelog_record *record, 
                       size_t why_bytes) {
     struct frameinfo info;
     const size_t i = c->plan.n_frames, row = c->plan.n_rows;
-    if (frameinfo_read(record->payload, record->bytes, &info, why, why_bytes) != 0 ||
+    if (frameinfo_peek(record->payload, record->bytes, &info, why, why_bytes) != 0 ||
         store_plan_add(&c->plan, &info, why, why_bytes) != 0)
         return -1;
     if (i == c->capacity) {
@@ -91,13 +92,11 @@ static int keep_frame(struct contents *c, const struct framelog_record *record, 
     return 0;
 }
 
-static int learn(struct framelog *log, struct contents *c, bool past_damage, char *why,
-                 size_t why_bytes) {
+static int learn(struct framelog *log, struct contents *c, char *why, size_t why_bytes) {
     struct framelog_record record;
-    uint64_t cut;
     int got, status = 0;
     framelog_rewind(log);
-    while (status == 0 && (got = framelog_read(log, &record, &cut, why, why_bytes)) == 1)
+    while (status == 0 && (got = framelog_skim(log, &record, why, why_bytes)) == 1)
         switch (record.kind) {
         case FRAMELOG_RUN:
             status = keep_text(&c->run, &record);
@@ -123,26 +122,33 @@ static int learn(struct framelog *log, struct contents *c, bool past_damage, cha
         snprintf(why, why_bytes, "out of memory");
         return -1;
     }
-    return got == 0 || past_damage ? 0 : -1;
+    return got;
 }
 
 static int write_frames(struct framelog *log, struct store *store, size_t n, char *why,
                         size_t why_bytes) {
     struct framelog_record record;
     struct frameinfo info;
-    uint64_t cut;
-    framelog_rewind(log);
-    while (n > 0) {
-        if (framelog_read(log, &record, &cut, why, why_bytes) != 1)
-            return -1;
-        if (record.kind != FRAMELOG_FRAME)
+    struct readahead *ahead = readahead_open(log);
+    int status = ahead ? 0 : -1;
+    if (!ahead)
+        snprintf(why, why_bytes, "out of memory");
+    while (status == 0 && n > 0) {
+        const int got = readahead_next(ahead, &record, why, why_bytes);
+        if (got == 0)
+            snprintf(why, why_bytes, "the log became shorter while it was read");
+        if (got != 1)
+            status = -1;
+        if (status != 0 || record.kind != FRAMELOG_FRAME)
             continue;
-        if (frameinfo_read(record.payload, record.bytes, &info, why, why_bytes) != 0 ||
+        // The record's digest, checked just now, covers the frame.
+        if (frameinfo_peek(record.payload, record.bytes, &info, why, why_bytes) != 0 ||
             store_add_frame(store, &info, record.payload, why, why_bytes) != 0)
-            return -1;
+            status = -1;
         n--;
     }
-    return 0;
+    readahead_close(ahead);
+    return status;
 }
 
 // ---- Probes: the daemon's CSV -----------------------------------------------------------------
@@ -362,8 +368,8 @@ static int put_in_place(const char *temporary, const char *file, char *why, size
     return -1;
 }
 
-int assemble(struct framelog *log, const char *file, int compress, bool past_damage,
-             struct assemble_result *out, char *why, size_t why_bytes) {
+int assemble(struct framelog *log, const char *file, int compress, struct assemble_result *out,
+             char *why, size_t why_bytes) {
     struct contents c = {0};
     struct stat status;
     const char *slash = strrchr(file, '/');
@@ -372,7 +378,7 @@ int assemble(struct framelog *log, const char *file, int compress, bool past_dam
     int result = -1;
     *out = (struct assemble_result){0};
     snprintf(why, why_bytes, "out of memory");
-    if (temporary && xdmf && xdmf_temporary && learn(log, &c, past_damage, why, why_bytes) == 0 &&
+    if (temporary && xdmf && xdmf_temporary && learn(log, &c, why, why_bytes) == 0 &&
         write_store(log, &c, temporary, compress, why, why_bytes) == 0 &&
         xdmf_write(xdmf_temporary, slash ? slash + 1 : file, &c.plan, c.times, c.rows, c.counts,
                    why, why_bytes) == 0 &&

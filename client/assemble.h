@@ -13,11 +13,11 @@ struct assemble_result {
     char run[72], state[24];
 };
 
-// Builds `file` anew from all good records of `log` and renames it into place, FILE.xdmf after it.
-// With `past_damage`, what precedes damage in the log is used. compress 0..9. 0, or -1 with `why`;
-// then what was at `file` before is still there.
-int assemble(struct framelog *log, const char *file, int compress, bool past_damage,
-             struct assemble_result *out, char *why, size_t why_bytes);
+// Builds `file` anew from all records of `log` that were read and found good, or appended, and
+// renames it into place, FILE.xdmf after it. compress 0..9. 0, or -1 with `why`; then what was at
+// `file` before is still there.
+int assemble(struct framelog *log, const char *file, int compress, struct assemble_result *out,
+             char *why, size_t why_bytes);
 
 // The name of the log that belongs to a recording, and of its XDMF; the caller frees them.
 char *assemble_log_name(const char *file);

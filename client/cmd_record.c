@@ -82,7 +82,7 @@ static int recover(struct client *client, const struct arguments *arguments) {
     if (cut > 0)
         terminal_note("%s: cut %llu bytes of an unfinished record", name, (unsigned long long)cut);
     int code = CLIENT_DONE;
-    if (assemble(log, file, (int)compress, true, &built, why, sizeof why) != 0) {
+    if (assemble(log, file, (int)compress, &built, why, sizeof why) != 0) {
         terminal_error("%s", why);
         code = CLIENT_IO;
     } else if (built.complete && got == 0 && unlink(name) != 0) {

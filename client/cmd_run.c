@@ -45,6 +45,12 @@ static char *request_body(const struct arguments *arguments) {
     while (status == 0 && (word = arguments_next(arguments, "set", &cursor)))
         status = overrides_add(patch, word);
     cJSON_AddTrueToObject(members, "start");
+    if (arguments_value(arguments, "output")) { // from the first frame on nothing is dropped
+        char name[RECORDER_NAME];
+        recorder_name(arguments_value(arguments, "output"), name);
+        cJSON_AddItemToArray(cJSON_AddArrayToObject(members, "recorders"),
+                             cJSON_CreateString(name));
+    }
     if (id)
         cJSON_AddStringToObject(members, "id", id);
     rest = cJSON_PrintUnformatted(members);

@@ -68,13 +68,10 @@ static bool read_field(const cJSON *item, const struct frameinfo *info, struct f
            bytes == info->count * f->components * dtype_bytes(f->dtype);
 }
 
-int frameinfo_read(const void *frame, size_t bytes, struct frameinfo *out, char *why,
-                   size_t why_bytes) {
-    struct frame_view view;
-    if (frame_open(frame, bytes, &view, why, why_bytes) != 0)
-        return -1;
-    *out = (struct frameinfo){.digest = view.digest, .total_bytes = view.total_bytes};
-    cJSON *header = cJSON_ParseWithLength(view.header, view.header_bytes);
+static int read_header(const struct frame_view *view, struct frameinfo *out, char *why,
+                       size_t why_bytes) {
+    *out = (struct frameinfo){.digest = view->digest, .total_bytes = view->total_bytes};
+    cJSON *header = cJSON_ParseWithLength(view->header, view->header_bytes);
     const cJSON *fields = cJSON_GetObjectItemCaseSensitive(header, "fields"), *item;
     const cJSON *time = cJSON_GetObjectItemCaseSensitive(header, "time");
     uint64_t dimension = 0, count = 0;
@@ -96,6 +93,22 @@ int frameinfo_read(const void *frame, size_t bytes, struct frameinfo *out, char 
     if (!good)
         snprintf(why, why_bytes, "has a header that lacks a member or contradicts its length");
     return good ? 0 : -1;
+}
+
+int frameinfo_read(const void *frame, size_t bytes, struct frameinfo *out, char *why,
+                   size_t why_bytes) {
+    struct frame_view view;
+    if (frame_open(frame, bytes, &view, why, why_bytes) != 0)
+        return -1;
+    return read_header(&view, out, why, why_bytes);
+}
+
+int frameinfo_peek(const void *frame, size_t bytes, struct frameinfo *out, char *why,
+                   size_t why_bytes) {
+    struct frame_view view;
+    if (frame_peek(frame, bytes, &view, why, why_bytes) != 0)
+        return -1;
+    return read_header(&view, out, why, why_bytes);
 }
 
 const struct frameinfo_field *frameinfo_field(const struct frameinfo *info, const char *name) {

@@ -29,5 +29,8 @@ struct frameinfo {
 // Checks and reads the frame in `frame`. 0, or -1 with one sentence in `why`.
 int frameinfo_read(const void *frame, size_t bytes, struct frameinfo *out, char *why,
                    size_t why_bytes);
+// The same of the beginning of a frame whose digest is known to be right.
+int frameinfo_peek(const void *frame, size_t bytes, struct frameinfo *out, char *why,
+                   size_t why_bytes);
 // The field of that name, or NULL.
 const struct frameinfo_field *frameinfo_field(const struct frameinfo *info, const char *name);

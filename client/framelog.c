@@ -15,8 +15,11 @@
 #include <unistd.h>
 #include <xxhash.h>
 
+#include "proto/frame.h"
+
 #define HEAD 64
 #define MAGIC "FBARREC1"
+#define SCAN_BYTES (1u << 20)
 
 struct head {
     char magic[8];
@@ -30,7 +33,9 @@ struct framelog {
     int fd;
     char *path;
     uint64_t end;      // of the good records
-    uint64_t durable;  // length known to be on disk
+    uint64_t durable;  // length known to be on disk, by this process
+    uint64_t known;    // likewise, by those before, as the records tell
+    uint64_t good;     // length of the records that were checked or written here
     uint64_t previous; // digest of the last head
     uint64_t cursor, cursor_previous;
     bool read_to_end;
@@ -44,6 +49,20 @@ static uint64_t padded(uint64_t n) {
 
 static uint64_t head_digest(const struct head *head) {
     return XXH3_64bits(head, offsetof(struct head, own));
+}
+
+// Of a frame, its preamble stands for all of it: the frame's own digest is in there.
+static uint64_t payload_digest(enum framelog_kind kind, const void *payload, size_t bytes) {
+    const bool frame = kind == FRAMELOG_FRAME && bytes > FRAME_PREAMBLE;
+    return XXH3_64bits(payload, frame ? FRAME_PREAMBLE : bytes);
+}
+
+static bool payload_whole(const struct head *head, const void *payload) {
+    struct frame_view view;
+    char why[128];
+    return payload_digest((enum framelog_kind)head->kind, payload, head->bytes) == head->digest &&
+           (head->kind != FRAMELOG_FRAME ||
+            frame_open(payload, head->bytes, &view, why, sizeof why) == 0);
 }
 
 static bool head_valid(const struct head *head) {
@@ -105,19 +124,34 @@ void framelog_rewind(struct framelog *log) {
     log->cursor = log->cursor_previous = 0;
 }
 
+void framelog_swap(struct framelog *log, unsigned char **buffer, size_t *capacity) {
+    unsigned char *payload = log->payload;
+    const size_t bytes = log->capacity;
+    log->payload = *buffer;
+    log->capacity = *capacity;
+    *buffer = payload;
+    *capacity = bytes;
+}
+
 // Whether a record after `from` was appended when the place `from` was already known to be on disk.
 static int durable_beyond(struct framelog *log, uint64_t from, uint64_t size, bool *out) {
-    struct head head;
+    unsigned char *block = malloc(SCAN_BYTES);
+    int status = block ? 0 : -1;
     *out = false;
-    for (uint64_t at = padded(from + 1); at + HEAD <= size; at += HEAD) {
-        if (read_at(log->fd, &head, HEAD, at) < 0)
-            return -1;
-        if (head_valid(&head) && head.durable > from) {
-            *out = true;
-            return 0;
+    for (uint64_t at = padded(from + 1); status == 0 && !*out && at + HEAD <= size;) {
+        const uint64_t left = (size - at) / HEAD * HEAD;
+        const size_t n = left < SCAN_BYTES ? (size_t)left : SCAN_BYTES;
+        if (read_at(log->fd, block, n, at) < 0)
+            status = -1;
+        for (size_t i = 0; status == 0 && !*out && i < n; i += HEAD) {
+            struct head head;
+            memcpy(&head, block + i, HEAD);
+            *out = head_valid(&head) && head.durable > from;
         }
+        at += n;
     }
-    return 0;
+    free(block);
+    return status;
 }
 
 static int fail_errno(const struct framelog *log, char *why, size_t why_bytes) {
@@ -150,6 +184,19 @@ static int end_of_log(struct framelog *log, uint64_t size, uint64_t *cut, char *
     return 0;
 }
 
+static int reserve(struct framelog *log, size_t bytes, char *why, size_t why_bytes) {
+    if (bytes <= log->capacity)
+        return 0;
+    unsigned char *grown = realloc(log->payload, bytes);
+    if (!grown) {
+        snprintf(why, why_bytes, "out of memory");
+        return -1;
+    }
+    log->payload = grown;
+    log->capacity = bytes;
+    return 0;
+}
+
 int framelog_read(struct framelog *log, struct framelog_record *out, uint64_t *cut, char *why,
                   size_t why_bytes) {
     struct stat status;
@@ -165,25 +212,52 @@ int framelog_read(struct framelog *log, struct framelog_record *out, uint64_t *c
     if (!head_valid(&head) || head.previous != log->cursor_previous ||
         head.bytes > size - log->cursor - HEAD)
         return end_of_log(log, size, cut, why, why_bytes);
-    if (head.bytes > log->capacity) {
-        unsigned char *grown = realloc(log->payload, head.bytes);
-        if (!grown) {
-            snprintf(why, why_bytes, "out of memory");
-            return -1;
-        }
-        log->payload = grown;
-        log->capacity = head.bytes;
-    }
+    if (reserve(log, head.bytes, why, why_bytes) != 0)
+        return -1;
     const int got = read_at(log->fd, log->payload, head.bytes, log->cursor + HEAD);
     if (got < 0)
         return fail_errno(log, why, why_bytes);
-    if (got == 0 || XXH3_64bits(log->payload, head.bytes) != head.digest ||
+    if (got == 0 || !payload_whole(&head, log->payload) ||
         log->cursor + HEAD + padded(head.bytes) > size)
         return end_of_log(log, size, cut, why, why_bytes);
     log->cursor += HEAD + padded(head.bytes);
     log->cursor_previous = head.own;
+    log->good = log->cursor > log->good ? log->cursor : log->good;
+    log->known = head.durable > log->known ? head.durable : log->known;
     *out = (struct framelog_record){
         .kind = (enum framelog_kind)head.kind, .payload = log->payload, .bytes = head.bytes};
+    return 1;
+}
+
+int framelog_skim(struct framelog *log, struct framelog_record *out, char *why, size_t why_bytes) {
+    struct head head;
+    if (log->cursor >= log->good)
+        return 0;
+    int got = read_at(log->fd, &head, HEAD, log->cursor);
+    size_t bytes = 0;
+    if (got == 1 && (!head_valid(&head) || head.bytes > log->good - log->cursor - HEAD))
+        got = 0;
+    if (got == 1 && head.kind == FRAMELOG_FRAME && head.bytes >= FRAME_PREAMBLE) {
+        unsigned char preamble[FRAME_PREAMBLE];
+        got = read_at(log->fd, preamble, FRAME_PREAMBLE, log->cursor + HEAD);
+        bytes = got == 1 ? frame_peek_bytes(preamble) : 0;
+    }
+    if (bytes == 0 || bytes > head.bytes)
+        bytes = head.bytes;
+    if (got == 1 && reserve(log, bytes, why, why_bytes) != 0)
+        return -1;
+    if (got == 1 && bytes > 0)
+        got = read_at(log->fd, log->payload, bytes, log->cursor + HEAD);
+    if (got < 0)
+        return fail_errno(log, why, why_bytes);
+    if (got == 0) {
+        snprintf(why, why_bytes, "%s: changed at byte %llu while it was read", log->path,
+                 (unsigned long long)log->cursor);
+        return -1;
+    }
+    log->cursor += HEAD + padded(head.bytes);
+    *out = (struct framelog_record){
+        .kind = (enum framelog_kind)head.kind, .payload = log->payload, .bytes = bytes};
     return 1;
 }
 
@@ -192,7 +266,7 @@ int framelog_append(struct framelog *log, enum framelog_kind kind, const void *p
     static const unsigned char zeros[HEAD];
     struct head head = {.kind = kind,
                         .bytes = bytes,
-                        .digest = XXH3_64bits(payload, bytes),
+                        .digest = payload_digest(kind, payload, bytes),
                         .durable = log->durable,
                         .previous = log->previous};
     memcpy(head.magic, MAGIC, 8);
@@ -223,7 +297,7 @@ int framelog_append(struct framelog *log, enum framelog_kind kind, const void *p
             parts[first].iov_len -= (size_t)wrote;
         }
     }
-    log->end = end;
+    log->end = log->good = end;
     log->previous = head.own;
     return 0;
 }
@@ -232,8 +306,14 @@ int framelog_sync(struct framelog *log, char *why, size_t why_bytes) {
     if (log->durable == log->end)
         return 0;
     struct stat here, named;
-    if (fdatasync(log->fd) != 0)
-        return fail_errno(log, why, why_bytes);
+    if (fdatasync(log->fd) != 0) {
+        fail_errno(log, why, why_bytes);
+        // A second fdatasync would report success for pages that the first one has given up.
+        const uint64_t safe = log->durable > log->known ? log->durable : log->known;
+        int ignored = ftruncate(log->fd, (off_t)safe);
+        (void)ignored;
+        return -1;
+    }
     // A log whose name is gone would be lost with this process: not durable.
     if (fstat(log->fd, &here) != 0 || stat(log->path, &named) != 0)
         return fail_errno(log, why, why_bytes);

@@ -2,11 +2,11 @@
 // complete.
 //
 // HDF5 1.10 does not survive a killed writer; this does. A record is a 64-byte head and a payload
-// padded to 64: magic "FBARREC1", u32 kind, u32 0, u64 payload bytes, u64 XXH3-64 of the payload,
-// u64 durable, u64 digest of the head before, u64 XXH3-64 of all these, zeros. `durable` is the
-// length of the log that was known to be on disk when the record was appended: damage beyond every
-// such length can only be a torn tail and is cut; damage below one is reported with its place and
-// nothing is touched.
+// padded to 64: magic "FBARREC1", u32 kind, u32 0, u64 payload bytes, u64 XXH3-64 of the payload
+// (of a frame: of its preamble, which holds the digest of the rest), u64 durable, u64 digest of the
+// head before, u64 XXH3-64 of all these, zeros. `durable` is the length of the log that was known
+// to be on disk when the record was appended: damage beyond every such length can only be a torn
+// tail and is cut; damage below one is reported with its place and nothing is touched.
 #pragma once
 #include <stdbool.h>
 #include <stddef.h>
@@ -40,11 +40,21 @@ void framelog_close(struct framelog *log);
 int framelog_read(struct framelog *log, struct framelog_record *out, uint64_t *cut, char *why,
                   size_t why_bytes);
 void framelog_rewind(struct framelog *log);
+// Exchanges the buffer that holds the payload of the last read with one of the caller's (from
+// malloc, or NULL), which keeps the payload.
+void framelog_swap(struct framelog *log, unsigned char **buffer, size_t *capacity);
+
+// The same without reading what is long: of a frame, `payload` is its preamble and header only
+// (`bytes` counts these). Gives the records that framelog_read has found good or that were appended
+// here, and no others.
+int framelog_skim(struct framelog *log, struct framelog_record *out, char *why, size_t why_bytes);
 
 // Appends at the end; only after everything has been read. A failed append leaves the log as it
 // was.
 int framelog_append(struct framelog *log, enum framelog_kind kind, const void *payload,
                     size_t bytes, char *why, size_t why_bytes);
-// On return 0 all that was appended survives a power failure.
+// On return 0 all that was appended survives a power failure. Otherwise what is not known to be on
+// the disk is cut off, since nobody can tell any more what would be there after such a failure: the
+// next recording asks for it again.
 int framelog_sync(struct framelog *log, char *why, size_t why_bytes);
 uint64_t framelog_bytes(const struct framelog *log);

@@ -1,4 +1,5 @@
 // fbar, the command-line client of fbard. The table below is the list of commands and the help.
+#include <malloc.h>
 #include <signal.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -114,6 +115,11 @@ static int run_command(const struct command *command, const struct arguments *gl
 int main(int argc, char **argv) {
     static struct arguments global, arguments; // large
     signal(SIGPIPE, SIG_IGN);
+    signal(SIGXFSZ, SIG_IGN); // a file over the limit is an error like a full disk
+    // Frames come and go by the megabyte: their memory is kept instead of being mapped, and cleared
+    // page by page, for each.
+    mallopt(M_MMAP_THRESHOLD, 32 << 20);
+    mallopt(M_TRIM_THRESHOLD, 128 << 20);
     interrupt_catch();
     const int used = arguments_parse(argc - 1, argv + 1, NULL, &global);
     if (used < 0)

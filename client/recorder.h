@@ -28,6 +28,11 @@ struct recorder_result {
 int recorder_record(struct client *client, const struct recorder_options *options,
                     struct recorder_result *result);
 
+// The name under which a recording into `file` is known to the daemon: the same command is the same
+// recorder. RECORDER_NAME bytes.
+#define RECORDER_NAME 40
+void recorder_name(const char *file, char *out);
+
 // Whether the file may take a recording of `run`: CLIENT_DONE, otherwise the fault is printed. To
 // be asked before a run is created.
 int recorder_check_file(const char *file, const char *run);

@@ -1,9 +1,7 @@
-// Writes and reads FILE.h5. The VTKHDF part follows the "VTKHDF format specification", version 2.0,
+// Writes FILE.h5. The VTKHDF part follows the "VTKHDF format specification", version 2.0,
 // sections "Poly data" and "Temporal data": the arrays of all frames stand one behind the other and
 // Steps says where each begins. One vertex cell a particle; since cells only count the points of a
 // frame from 0, all frames share one connectivity (the offsets of a step may repeat).
-#include "client/store.h"
-
 #include <errno.h>
 #include <fcntl.h>
 #include <hdf5.h>
@@ -12,6 +10,8 @@
 #include <stdlib.h>
 #include <string.h>
 #include <unistd.h>
+
+#include "client/store_inside.h"
 
 // Chunks near this size: small enough to read one frame of many, large enough to compress.
 #define CHUNK_BYTES 262144
@@ -83,6 +83,7 @@ int store_plan_add(struct store_plan *plan, const struct frameinfo *info, char *
         const struct frameinfo_field *field = &info->fields[i];
         const struct store_field *known = plan_field(plan, field->name);
         if (known && known->rank == field->rank && known->components == field->components) {
+            plan->fields[known - plan->fields].n_rows += info->count;
             if (strcmp(field->dtype, "<f8") == 0) // the widest that occurs holds them all
                 memcpy(plan->fields[known - plan->fields].dtype, "<f8", 4);
             continue;
@@ -93,7 +94,8 @@ int store_plan_add(struct store_plan *plan, const struct frameinfo *info, char *
             return -1;
         }
         struct store_field *added = &plan->fields[plan->n_fields++];
-        *added = (struct store_field){.rank = field->rank, .components = field->components};
+        *added = (struct store_field){
+            .rank = field->rank, .components = field->components, .n_rows = info->count};
         snprintf(added->name, sizeof added->name, "%s", field->name);
         snprintf(added->unit, sizeof added->unit, "%s", field->unit);
         snprintf(added->dtype, sizeof added->dtype, "%s", field->dtype);
@@ -117,8 +119,13 @@ static herr_t deepest(unsigned n, const H5E_error2_t *error, void *context) {
     return 0;
 }
 
-// Fills `why` from HDF5's error stack, whose innermost entry knows the system's reason.
-static int fail(const char *path, char *why, size_t why_bytes) {
+void store_begin(void) {
+    // HDF5 1.10 crashes at the process's exit over a file that it could not close for want of room.
+    H5dont_atexit();
+    H5Eset_auto2(H5E_DEFAULT, NULL, NULL);
+}
+
+int store_fail(const char *path, char *why, size_t why_bytes) {
     char reason[256] = "HDF5 failed";
     H5Ewalk2(H5E_DEFAULT, H5E_WALK_UPWARD, deepest, reason);
     const char *message = strstr(reason, "error message = '");
@@ -207,27 +214,38 @@ static hsize_t chunk_rows(size_t rows, size_t per_frame, size_t row_bytes) {
 struct shape {
     size_t rows, columns; // columns 0: one-dimensional
     size_t per_frame;     // rows that are read together
+    bool whole;           // every row will be written: HDF5 need not fill it before
 };
+
+// Compressed arrays need chunks. Others lie in one piece: rows go from the frame to the file
+// without a stay in a chunk cache, which halves the time of building the file.
+static void put_layout(hid_t create, struct shape shape, size_t row_bytes, int compress) {
+    if (compress > 0) {
+        const hsize_t chunk[2] = {chunk_rows(shape.rows, shape.per_frame, row_bytes),
+                                  shape.columns};
+        H5Pset_chunk(create, shape.columns ? 2 : 1, chunk);
+        H5Pset_shuffle(create);
+        H5Pset_deflate(create, (unsigned)compress);
+    } else {
+        H5Pset_layout(create, H5D_CONTIGUOUS);
+        H5Pset_alloc_time(create, H5D_ALLOC_TIME_EARLY); // so that its place depends on no write
+    }
+    H5Pset_fill_time(create, shape.whole ? H5D_FILL_TIME_NEVER : H5D_FILL_TIME_ALLOC);
+}
 
 static hid_t make_dataset(hid_t at, const char *name, hid_t type, struct shape shape, int compress,
                           const char *unit, const char *text) {
     const int rank = shape.columns ? 2 : 1;
     const hsize_t extent[2] = {shape.rows, shape.columns};
-    const hsize_t limit[2] = {H5S_UNLIMITED, shape.columns};
     const size_t row_bytes = H5Tget_size(type) * (shape.columns ? shape.columns : 1);
-    const hsize_t chunk[2] = {chunk_rows(shape.rows, shape.per_frame, row_bytes), shape.columns};
-    const hid_t space = H5Screate_simple(rank, extent, limit);
+    const hid_t space = H5Screate_simple(rank, extent, NULL);
     const hid_t create = H5Pcreate(H5P_DATASET_CREATE), access = H5Pcreate(H5P_DATASET_ACCESS);
     H5Pset_obj_track_times(create, 0);
-    H5Pset_chunk(create, rank, chunk);
+    put_layout(create, shape, row_bytes, compress);
     if (H5Tget_class(type) == H5T_FLOAT)
         H5Pset_fill_value(create, H5T_NATIVE_DOUBLE, &fill_double);
     else
         H5Pset_fill_value(create, H5T_NATIVE_UINT32, &fill_integer);
-    if (compress > 0) {
-        H5Pset_shuffle(create);
-        H5Pset_deflate(create, (unsigned)compress);
-    }
     H5Pset_chunk_cache(access, 521, CHUNK_CACHE_BYTES, 1.0);
     const hid_t dataset = H5Dcreate2(at, name, type, space, H5P_DEFAULT, create, access);
     H5Pclose(create);
@@ -243,7 +261,7 @@ static hid_t make_dataset(hid_t at, const char *name, hid_t type, struct shape s
 // A whole small dataset at once.
 static int put_dataset(hid_t at, const char *name, hid_t type, hid_t memory_type, size_t rows,
                        size_t columns, const void *values, const char *unit, const char *text) {
-    const struct shape shape = {.rows = rows, .columns = columns, .per_frame = rows};
+    const struct shape shape = {.rows = rows, .columns = columns, .per_frame = rows, .whole = true};
     const hid_t dataset = make_dataset(at, name, type, shape, 0, unit, text);
     if (dataset < 0)
         return -1;
@@ -347,7 +365,8 @@ static int make_arrays(struct store *s, int compress) {
         const bool position = strcmp(f->name, "position") == 0;
         const struct shape shape = {.rows = s->plan.n_rows,
                                     .columns = f->file_components > 1 ? f->file_components : 0,
-                                    .per_frame = s->plan.most_particles};
+                                    .per_frame = s->plan.most_particles,
+                                    .whole = f->n_rows == s->plan.n_rows};
         s->arrays[i] = make_dataset(position ? s->vtk : data, position ? "Points" : f->name,
                                     file_type(f->dtype), shape, compress, f->unit,
                                     long_name(f->name, buffer, sizeof buffer));
@@ -359,7 +378,7 @@ static int make_arrays(struct store *s, int compress) {
 
 struct store *store_create(const char *path, const struct store_plan *plan,
                            const struct store_about *about, char *why, size_t why_bytes) {
-    H5Eset_auto2(H5E_DEFAULT, NULL, NULL);
+    store_begin();
     struct store *s = calloc(1, sizeof *s);
     const size_t n = plan->n_frames + 1; // never calloc(0)
     if (!s || !(s->path = strdup(path)) || !(s->seq = calloc(n, 8)) || !(s->step = calloc(n, 8)) ||
@@ -378,7 +397,7 @@ struct store *store_create(const char *path, const struct store_plan *plan,
     s->file = H5Fcreate(path, H5F_ACC_TRUNC, create, H5P_DEFAULT);
     H5Pclose(create);
     if (s->file < 0 || put_header(s, about) != 0 || make_arrays(s, about->compress) != 0) {
-        fail(path, why, why_bytes);
+        store_fail(path, why, why_bytes);
         store_abandon(s);
         return NULL;
     }
@@ -388,6 +407,29 @@ struct store *store_create(const char *path, const struct store_plan *plan,
 static size_t index_of_array(const struct store *s, const char *name) {
     return (size_t)(plan_field(&s->plan, name) - s->plan.fields);
 }
+
+// Rows of `side` (or, of a tensor, side x side) components into rows of 3 (3 x 3), the rest 0.
+// Nearly every value of a 2D recording goes through here, so each type has its own loop.
+#define DEFINE_PAD(name, type)                                                                     \
+    static void name(void *out, const void *in, size_t count, size_t side, bool tensor) {          \
+        type *to = out;                                                                            \
+        const type *from = in;                                                                     \
+        if (!tensor && side == 2) {                                                                \
+            for (size_t p = 0; p < count; p++) {                                                   \
+                to[3 * p] = from[2 * p];                                                           \
+                to[3 * p + 1] = from[2 * p + 1];                                                   \
+                to[3 * p + 2] = 0;                                                                 \
+            }                                                                                      \
+            return;                                                                                \
+        }                                                                                          \
+        const size_t rows = tensor ? side : 1, width = tensor ? 9 : 3;                             \
+        for (size_t p = 0; p < count; p++, to += width)                                            \
+            for (size_t r = 0; r < width / 3; r++)                                                 \
+                for (size_t c = 0; c < 3; c++)                                                     \
+                    to[3 * r + c] = r < rows && c < side ? from[(p * rows + r) * side + c] : 0;    \
+    }
+DEFINE_PAD(pad_doubles, uint64_t) // bits are copied, not numbers
+DEFINE_PAD(pad_words, uint32_t)
 
 // A 2D vector or tensor with its third components 0.
 static const void *pad_field(struct store *s, const struct frameinfo_field *from, size_t count,
@@ -403,12 +445,10 @@ static const void *pad_field(struct store *s, const struct frameinfo_field *from
         s->padded = grown;
         s->padded_bytes = need;
     }
-    memset(s->padded, 0, need);
-    const size_t rows = from->rank == 3 ? side : 1;
-    for (size_t p = 0; p < count; p++)
-        for (size_t r = 0; r < rows; r++)
-            memcpy(s->padded + (p * to->file_components + 3 * r) * bytes,
-                   values + (p * from->components + side * r) * bytes, side * bytes);
+    if (bytes == 8)
+        pad_doubles(s->padded, values, count, side, from->rank == 3);
+    else
+        pad_words(s->padded, values, count, side, from->rank == 3);
     return s->padded;
 }
 
@@ -430,7 +470,7 @@ int store_add_frame(struct store *s, const struct frameinfo *info, const void *f
         }
         if (put_rows(s->arrays[k], file_type(from->dtype), s->row, info->count,
                      to->file_components > 1 ? to->file_components : 0, values) != 0)
-            return fail(s->path, why, why_bytes);
+            return store_fail(s->path, why, why_bytes);
     }
     const size_t n = s->n_added++;
     s->seq[n] = info->seq;
@@ -450,7 +490,7 @@ int store_add_probe(struct store *s, const struct store_probe *probe, size_t n,
                     size_t why_bytes) {
     const hid_t group = make_group(s->probes, probe->name);
     if (group < 0)
-        return fail(s->path, why, why_bytes);
+        return store_fail(s->path, why, why_bytes);
     int status = put_text(group, "components", probe->components);
     if (status == 0)
         status = put_dataset(group, "step", H5T_STD_I64LE, H5T_NATIVE_UINT64, n, 0, steps, "1",
@@ -464,7 +504,7 @@ int store_add_probe(struct store *s, const struct store_probe *probe, size_t n,
                              probe->long_name);
     if (H5Gclose(group) < 0)
         status = -1;
-    return status == 0 ? 0 : fail(s->path, why, why_bytes);
+    return status == 0 ? 0 : store_fail(s->path, why, why_bytes);
 }
 
 int store_add_changes(struct store *s, size_t n, const uint64_t *steps, const double *times,
@@ -482,7 +522,7 @@ int store_add_changes(struct store *s, size_t n, const uint64_t *steps, const do
             put_json(group, "patch", n, patches, false, "merge patch of the configuration, JSON");
     if (group >= 0 && H5Gclose(group) < 0)
         status = -1;
-    return status == 0 ? 0 : fail(s->path, why, why_bytes);
+    return status == 0 ? 0 : store_fail(s->path, why, why_bytes);
 }
 
 // One vertex a particle, shared by all frames; the other topologies of PolyData are there and
@@ -615,7 +655,7 @@ int store_finish(struct store *s, char *why, size_t why_bytes) {
     if (s->n_added != s->plan.n_frames)
         snprintf(why, why_bytes, "%s: fewer frames than were planned", s->path);
     else if (put_topology(s) != 0 || put_steps(s) != 0 || put_frames(s) != 0 || close_all(s) != 0)
-        fail(s->path, why, why_bytes);
+        store_fail(s->path, why, why_bytes);
     else
         status = 0;
     if (status == 0) {
@@ -646,213 +686,4 @@ void store_abandon(struct store *s) {
     free(s->fbar);
     free(s->padded);
     free(s);
-}
-
-// ---- Reading ----------------------------------------------------------------------------------
-
-struct store_file {
-    char *path;
-    hid_t file;
-    struct store_contents contents;
-    void *owned[16];
-    size_t n_owned;
-};
-
-static void get_text(hid_t at, const char *name, char *out, size_t n) {
-    out[0] = '\0';
-    const hid_t attribute = H5Aopen(at, name, H5P_DEFAULT);
-    if (attribute < 0)
-        return;
-    const hid_t type = H5Aget_type(attribute);
-    const size_t bytes = H5Tget_size(type);
-    char *text =
-        H5Tget_class(type) == H5T_STRING && !H5Tis_variable_str(type) ? calloc(bytes + 1, 1) : NULL;
-    if (text && H5Aread(attribute, type, text) >= 0)
-        snprintf(out, n, "%s", text);
-    free(text);
-    H5Tclose(type);
-    H5Aclose(attribute);
-}
-
-static int get_integer(hid_t at, const char *name) {
-    int value = 0;
-    const hid_t attribute = H5Aopen(at, name, H5P_DEFAULT);
-    if (attribute >= 0) {
-        H5Aread(attribute, H5T_NATIVE_INT, &value);
-        H5Aclose(attribute);
-    }
-    return value;
-}
-
-// A whole one-dimensional dataset of `*n` values (any number, where *n is 0), owned by the file.
-static const void *get_column(struct store_file *f, const char *name, hid_t type, size_t *n) {
-    const hid_t dataset = H5Dopen2(f->file, name, H5P_DEFAULT);
-    if (dataset < 0)
-        return NULL;
-    const hid_t space = H5Dget_space(dataset);
-    const hssize_t points = H5Sget_simple_extent_npoints(space);
-    H5Sclose(space);
-    void *values = NULL;
-    if (points >= 0 && (*n == SIZE_MAX || (size_t)points == *n) && f->n_owned < 16) {
-        values = calloc((size_t)points + 1, H5Tget_size(type));
-        if (values && H5Dread(dataset, type, H5S_ALL, H5S_ALL, H5P_DEFAULT, values) < 0) {
-            free(values);
-            values = NULL;
-        }
-        *n = (size_t)points;
-    }
-    H5Dclose(dataset);
-    if (values)
-        f->owned[f->n_owned++] = values;
-    return values;
-}
-
-static const char *get_scene(struct store_file *f) {
-    const hid_t dataset = H5Dopen2(f->file, "/fbard/scene", H5P_DEFAULT);
-    if (dataset < 0)
-        return "";
-    const hid_t type = H5Dget_type(dataset);
-    char *text = NULL;
-    if (H5Tget_class(type) == H5T_STRING && H5Tis_variable_str(type) == 0)
-        text = calloc(H5Tget_size(type) + 1, 1);
-    if (text && H5Dread(dataset, type, H5S_ALL, H5S_ALL, H5P_DEFAULT, text) >= 0) {
-        f->owned[f->n_owned++] = text;
-    } else {
-        free(text);
-        text = NULL;
-    }
-    H5Tclose(type);
-    H5Dclose(dataset);
-    return text ? text : "";
-}
-
-static herr_t on_array(hid_t group, const char *name, const H5L_info_t *info, void *context) {
-    (void)info;
-    struct store_contents *c = context;
-    const hid_t dataset = H5Dopen2(group, name, H5P_DEFAULT);
-    if (dataset < 0 || c->n_arrays == STORE_MAX_FIELDS)
-        return 0;
-    struct store_array *array = &c->arrays[c->n_arrays++];
-    const hid_t space = H5Dget_space(dataset), type = H5Dget_type(dataset);
-    hsize_t extent[2] = {0, 1};
-    if (H5Sget_simple_extent_ndims(space) <= 2)
-        H5Sget_simple_extent_dims(space, extent, NULL);
-    array->components = extent[1];
-    snprintf(array->name, sizeof array->name, "%s", name);
-    snprintf(array->dtype, sizeof array->dtype, "<%c%zu",
-             H5Tget_class(type) == H5T_FLOAT ? 'f' : 'u', H5Tget_size(type));
-    get_text(dataset, "unit", array->unit, sizeof array->unit);
-    get_text(dataset, "long_name", array->long_name, sizeof array->long_name);
-    H5Tclose(type);
-    H5Sclose(space);
-    H5Dclose(dataset);
-    return 0;
-}
-
-static int get_contents(struct store_file *f) {
-    struct store_contents *c = &f->contents;
-    const hid_t fbard = H5Gopen2(f->file, "/fbard", H5P_DEFAULT);
-    if (fbard < 0)
-        return -1;
-    get_text(fbard, "format", c->format, sizeof c->format);
-    get_text(fbard, "run", c->run, sizeof c->run);
-    get_text(fbard, "code_version", c->code_version, sizeof c->code_version);
-    get_text(fbard, "state", c->state, sizeof c->state);
-    c->complete = get_integer(fbard, "complete") != 0;
-    c->dimension = get_integer(fbard, "dimension");
-    H5Gclose(fbard);
-    if (strcmp(c->format, STORE_FORMAT) != 0)
-        return -1;
-    size_t n = SIZE_MAX, changes = SIZE_MAX;
-    c->seq = get_column(f, "/fbard/frames/seq", H5T_NATIVE_UINT64, &n);
-    c->step = get_column(f, "/fbard/frames/step", H5T_NATIVE_UINT64, &n);
-    c->digest = get_column(f, "/fbard/frames/digest", H5T_NATIVE_UINT64, &n);
-    c->epoch = get_column(f, "/fbard/frames/epoch", H5T_NATIVE_UINT64, &n);
-    c->count = get_column(f, "/fbard/frames/count", H5T_NATIVE_UINT64, &n);
-    c->row = get_column(f, "/fbard/frames/row", H5T_NATIVE_UINT64, &n);
-    c->time = get_column(f, "/fbard/frames/time", H5T_NATIVE_DOUBLE, &n);
-    c->fbar = get_column(f, "/fbard/frames/fbar", H5T_NATIVE_UINT8, &n);
-    if (!c->seq || !c->step || !c->digest || !c->epoch || !c->count || !c->row || !c->time ||
-        !c->fbar)
-        return -1;
-    c->n_frames = n;
-    c->scene = get_scene(f);
-    if (get_column(f, "/fbard/changes/step", H5T_NATIVE_UINT64, &changes))
-        c->n_changes = changes;
-    H5G_info_t info;
-    if (H5Gget_info_by_name(f->file, "/fbard/probes", &info, H5P_DEFAULT) >= 0)
-        c->n_probes = info.nlinks;
-    const hid_t data = H5Gopen2(f->file, "/VTKHDF/PointData", H5P_DEFAULT);
-    if (data < 0)
-        return -1;
-    hsize_t at = 0;
-    H5Literate(data, H5_INDEX_NAME, H5_ITER_INC, &at, on_array, c);
-    H5Gclose(data);
-    return 0;
-}
-
-struct store_file *store_open(const char *path, bool *foreign, char *why, size_t why_bytes) {
-    H5Eset_auto2(H5E_DEFAULT, NULL, NULL);
-    *foreign = false;
-    if (access(path, R_OK) != 0) {
-        snprintf(why, why_bytes, "%s: %s", path, strerror(errno));
-        return NULL;
-    }
-    struct store_file *f = calloc(1, sizeof *f);
-    if (!f || !(f->path = strdup(path))) {
-        free(f);
-        snprintf(why, why_bytes, "out of memory");
-        return NULL;
-    }
-    f->file = H5Fopen(path, H5F_ACC_RDONLY, H5P_DEFAULT);
-    if (f->file < 0 || get_contents(f) != 0) {
-        *foreign = true;
-        snprintf(why, why_bytes, "%s: is no recording of fbard", path);
-        store_close(f);
-        return NULL;
-    }
-    return f;
-}
-
-const struct store_contents *store_contents(const struct store_file *file) {
-    return &file->contents;
-}
-
-int store_read_array(struct store_file *f, const char *name, size_t frame, double *out, char *why,
-                     size_t why_bytes) {
-    char place[96];
-    if (strcmp(name, "position") == 0)
-        snprintf(place, sizeof place, "/VTKHDF/Points");
-    else
-        snprintf(place, sizeof place, "/VTKHDF/PointData/%s", name);
-    const hid_t dataset = H5Dopen2(f->file, place, H5P_DEFAULT);
-    if (dataset < 0)
-        return fail(f->path, why, why_bytes);
-    const hid_t space = H5Dget_space(dataset);
-    const int rank = H5Sget_simple_extent_ndims(space);
-    hsize_t extent[2] = {0, 0}, start[2] = {f->contents.row[frame], 0};
-    int status = -1;
-    if (rank == 1 || rank == 2) {
-        H5Sget_simple_extent_dims(space, extent, NULL);
-        const hsize_t count[2] = {f->contents.count[frame], extent[1]};
-        const hid_t memory = H5Screate_simple(rank, count, NULL);
-        if (H5Sselect_hyperslab(space, H5S_SELECT_SET, start, NULL, count, NULL) >= 0 &&
-            H5Dread(dataset, H5T_NATIVE_DOUBLE, memory, space, H5P_DEFAULT, out) >= 0)
-            status = 0;
-        H5Sclose(memory);
-    }
-    H5Sclose(space);
-    H5Dclose(dataset);
-    return status == 0 ? 0 : fail(f->path, why, why_bytes);
-}
-
-void store_close(struct store_file *f) {
-    if (!f)
-        return;
-    for (size_t i = 0; i < f->n_owned; i++)
-        free(f->owned[i]);
-    if (f->file >= 0)
-        H5Fclose(f->file);
-    free(f->path);
-    free(f);
 }

@@ -19,6 +19,7 @@ struct store_field {
     int rank;               // 1 scalar, 2 vector, 3 tensor
     size_t components;      // in the frame
     size_t file_components; // 1, 3 or 9
+    size_t n_rows;          // that the frames have of it
 };
 
 // What the frames hold altogether: HDF5 is told the sizes before the first frame.

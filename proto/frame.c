@@ -230,7 +230,15 @@ static int refuse(char *why, size_t why_bytes, const char *sentence) {
     return -1;
 }
 
-int frame_open(const void *frame, size_t bytes, struct frame_view *out, char *why,
+size_t frame_peek_bytes(const void *preamble) {
+    uint32_t header_bytes;
+    if (frame_stated_bytes(preamble, FRAME_PREAMBLE) == 0)
+        return 0;
+    memcpy(&header_bytes, (const unsigned char *)preamble + AT_HEADER_BYTES, sizeof header_bytes);
+    return FRAME_PREAMBLE + (size_t)header_bytes;
+}
+
+int frame_peek(const void *frame, size_t bytes, struct frame_view *out, char *why,
                size_t why_bytes) {
     const unsigned char *at = frame;
     uint32_t header_bytes, flags;
@@ -251,10 +259,8 @@ int frame_open(const void *frame, size_t bytes, struct frame_view *out, char *wh
     if (header_bytes == 0 || header_bytes % FRAME_ALIGN != 0 || total < FRAME_PREAMBLE ||
         header_bytes > total - FRAME_PREAMBLE)
         return refuse(why, why_bytes, "states lengths that contradict each other");
-    if (total > bytes)
+    if (bytes - FRAME_PREAMBLE < header_bytes)
         return refuse(why, why_bytes, "is cut short");
-    if (XXH3_64bits(at + FRAME_PREAMBLE, total - FRAME_PREAMBLE) != digest)
-        return refuse(why, why_bytes, "does not match its digest");
 
     // The digest does not cover the header's stated length; the text itself does.
     const char *header = (const char *)at + FRAME_PREAMBLE;
@@ -266,5 +272,17 @@ int frame_open(const void *frame, size_t bytes, struct frame_view *out, char *wh
             return refuse(why, why_bytes, "has a header that is not padded with spaces");
     *out = (struct frame_view){
         .header = header, .header_bytes = header_bytes, .digest = digest, .total_bytes = total};
+    return 0;
+}
+
+int frame_open(const void *frame, size_t bytes, struct frame_view *out, char *why,
+               size_t why_bytes) {
+    if (frame_peek(frame, bytes, out, why, why_bytes) != 0)
+        return -1;
+    if (out->total_bytes > bytes)
+        return refuse(why, why_bytes, "is cut short");
+    if (XXH3_64bits((const unsigned char *)frame + FRAME_PREAMBLE,
+                    out->total_bytes - FRAME_PREAMBLE) != out->digest)
+        return refuse(why, why_bytes, "does not match its digest");
     return 0;
 }

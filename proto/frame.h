@@ -54,5 +54,11 @@ struct frame_view {
 // `bytes`.
 int frame_open(const void *frame, size_t bytes, struct frame_view *out, char *why,
                size_t why_bytes);
+// The same of a frame of which only the first `bytes` are there, preamble and header among them:
+// all is checked but the digest and that the rest is there.
+int frame_peek(const void *frame, size_t bytes, struct frame_view *out, char *why,
+               size_t why_bytes);
+// How much of a frame frame_peek needs, by its preamble (FRAME_PREAMBLE bytes); 0 when it is none.
+size_t frame_peek_bytes(const void *preamble);
 // The total length that a preamble states, or 0 when it is no preamble. `bytes` >= FRAME_PREAMBLE.
 uint64_t frame_stated_bytes(const void *preamble, size_t bytes);

@@ -13,7 +13,8 @@
 
 enum journal_result {
     JOURNAL_OK,
-    JOURNAL_FULL,  // no room now; the same call may succeed later
+    JOURNAL_FULL,  // no room on the disk now; the same call may succeed later
+    JOURNAL_HELD,  // no room in the budget: likewise, once a recorder has acknowledged more
     JOURNAL_ERROR, // anything else
 };
 
@@ -47,6 +48,10 @@ struct journal *journal_open(const char *data_dir, const char *id, char *why);
 void journal_close(struct journal *journal);                         // leaves the files
 int journal_remove(const char *data_dir, const char *id, char *why); // 0 or -1
 
+// What an entry survives: the process (as created), or with `on` a power failure as well: then
+// every entry is fsynced before it counts, and so is all that was there before.
+enum journal_result journal_power(struct journal *journal, bool on, char *why);
+
 uint64_t journal_cut_bytes(const struct journal *journal); // of the torn tail, when opened
 
 // ---- Small files ------------------------------------------------------------------------------
@@ -63,26 +68,46 @@ enum journal_result journal_replace(struct journal *journal, const char *name, c
 
 // ---- Events: events.jsonl, one JSON object a line ---------------------------------------------
 
-// Appends `json` (no newline in it); it survives kill -9 once this returns.
+// Appends `json` (an object, no newline in it); it survives kill -9 once this returns.
 enum journal_result journal_append_event(struct journal *journal, const char *json, char *why);
 uint64_t journal_n_events(struct journal *journal); // lines in the log
 
 // ---- Frames -----------------------------------------------------------------------------------
 
-// Bytes of frames to keep; the oldest segments go beyond it.
+// Bytes of frames to keep; the oldest segments go beyond it, as far as they may.
 void journal_budget(struct journal *journal, uint64_t bytes);
+// Frames from this number on must not go (none when it is UINT64_MAX, as at first). May be called
+// from any thread.
+void journal_keep(struct journal *journal, uint64_t seq);
+// Whether frames that must not go fill the budget.
+bool journal_held(struct journal *journal);
+// While allowed, the budget does not hold frames back: for those that are on their way when a
+// checkpoint needs them, and for the end of a run.
+void journal_overdraw(struct journal *journal, bool allowed);
 // Appends a sealed frame of info->bytes bytes as number info->seq, which must be the next one.
 enum journal_result journal_append_frame(struct journal *journal, const void *frame,
                                          const struct journal_frame *info, char *why);
-uint64_t journal_n_frames(struct journal *journal);    // seq of the next one
-uint64_t journal_n_gone(struct journal *journal);      // frames 0 .. n-1 were dropped
-uint64_t journal_frame_bytes(struct journal *journal); // on disk
+uint64_t journal_n_frames(struct journal *journal);                 // seq of the next one
+uint64_t journal_n_gone(struct journal *journal);                   // frames 0 .. n-1 were dropped
+uint64_t journal_frame_bytes(struct journal *journal);              // on disk
+uint64_t journal_bytes_from(struct journal *journal, uint64_t seq); // of the frames from this on
 bool journal_frame(struct journal *journal, uint64_t seq, struct journal_frame *out);
 // The newest frame with step <= `step`; false when there is none.
 bool journal_frame_at_step(struct journal *journal, uint64_t step, struct journal_frame *out);
 // A new descriptor on the frame's segment (frame at out->offset), which the caller closes; -1 when
 // there is no such frame or it fails its digest.
 int journal_frame_open(struct journal *journal, uint64_t seq, struct journal_frame *out, char *why);
+
+// A frame in the journal as memory that the file stands behind, so that who still waits to send it
+// holds none of the process's own. It stays readable when its segment goes.
+struct journal_map {
+    void *base;
+    size_t base_bytes;
+    unsigned char *frame;
+    size_t bytes;
+};
+bool journal_frame_map(struct journal *journal, uint64_t seq, struct journal_map *out, char *why);
+void journal_frame_unmap(struct journal_map *map);
 
 // ---- Checkpoints ------------------------------------------------------------------------------
 

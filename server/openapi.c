@@ -78,7 +78,9 @@ static const struct {
      "ies\":{\"scene\":{\"type\":[\"string\",\"object\"],\"description\":\"name of a built-i"
      "n scene, or a scene\"},\"overrides\":{\"type\":\"object\",\"description\":\"merge patc"
      "h (RFC 7396) on the scene\"},\"id\":{\"type\":\"string\",\"pattern\":\"^[A-Za-z0-9][A-"
-     "Za-z0-9._-]{0,63}$\"},\"start\":{\"type\":\"boolean\",\"default\":true},\"wait_subscri"
+     "Za-z0-9._-]{0,63}$\"},\"recorders\":{\"type\":\"array\",\"items\":{\"type\":\"string\"},"
+     "\"maxItems\":64},"
+     "\"start\":{\"type\":\"boolean\",\"default\":true},\"wait_subscri"
      "bers\":{\"type\":\"integer\",\"const\":0}}}"},
     {"State",
      "{\"enum\":[\"queued\",\"running\",\"waiting\",\"paused\",\"completed\",\"failed\",\"ca"
@@ -97,7 +99,10 @@ static const struct {
             "nings\":{\"type\":\"array\",\"items\":{\"type\":\"string\"}},\"changes\":{\"type\":"
             "\"array\",\"items\":{\"type\":\"object\",\"required\":[\"step\",\"time\",\"patch\"],"
             "\"properties\":{\"step\":{\"type\":\"integer\"},\"time\":{\"$ref\":\"#/components/"
-            "schemas/Number\"},\"patch\":{\"type\":\"object\"}}}},\"performance\":{\"type\""
+            "schemas/"
+            "Number\"},\"patch\":{\"type\":\"object\"}}}},\"journal\":{\"type\":[\"object\","
+            "\"null\"]},\"recorders\":{\"type\":\"array\","
+            "\"items\":{\"$ref\":\"#/components/schemas/Recorder\"}},\"performance\":{\"type\""
             ":\"object\",\"required\":[\"wall_s\",\"particle_steps_per_s\",\"bytes_per_particle\","
             "\"phases\"],\"properties\":{\"wall_s\":{\"type\":\"number\"},\"particle_steps_per_s\":"
             "{\"$ref\":\"#/components/schemas/Number\"},\"bytes_per_particle\":{\"$ref\":\"#/compon"
@@ -133,8 +138,22 @@ static const struct {
      "{\"type\":\"object\",\"required\":[\"step\",\"time\",\"probes\"],\"properties\":{\"ste"
      "p\":{\"type\":\"array\",\"items\":{\"type\":\"integer\"}},\"time\":{\"type\":\"array\""
      ",\"items\":{\"type\":\"number\"}},\"probes\":{\"type\":\"object\"}}}"},
+    {"Acknowledge",
+     "{\"type\":\"object\",\"required\":[\"acked\"],\"additionalProperties\":false,"
+     "\"properties\":{\"acked\":{\"type\":\"integer\",\"minimum\":-1,\"description\":\"number "
+     "of the last frame that is safe, with all before it; -1: none yet\"}}}"},
+    {"Recorder",
+     "{\"type\":\"object\",\"required\":[\"name\",\"acked\",\"lag_frames\",\"lag_bytes\"],"
+     "\"properties\":{\"name\":{\"type\":\"string\"},\"acked\":{\"type\":\"integer\",\"minimum\""
+     ":-1},\"lag_frames\":{\"type\":\"integer\"},\"lag_bytes\":{\"type\":\"integer\"},"
+     "\"silent_s\":{\"type\":\"number\"},\"first\":{\"type\":\"integer\"}}}"},
+    {"Recorders",
+     "{\"type\":\"object\",\"required\":[\"recorders\"],\"properties\":{\"recorders\":{"
+     "\"type\":\"array\",\"items\":{\"$ref\":\"#/components/schemas/Recorder\"}}}}"},
     {"Frames",
-     "{\"type\":\"object\",\"required\":[\"frames\"],\"properties\":{\"first\":{\"type\":\"i"
+     "{\"type\":\"object\",\"required\":[\"frames\"],\"properties\":{\"gone\":{\"type\":"
+     "\"array\",\"items\":{\"type\":\"object\",\"required\":[\"from\",\"to\"],\"properties\":{"
+     "\"from\":{\"type\":\"integer\"},\"to\":{\"type\":\"integer\"}}}},\"first\":{\"type\":\"i"
      "nteger\"},\"frames\":{\"type\":\"array\",\"items\":{\"type\":\"object\",\"required\":["
      "\"seq\",\"step\",\"time\",\"bytes\"],\"properties\":{\"seq\":{\"type\":\"integer\"},\""
      "step\":{\"type\":\"integer\"},\"time\":{\"type\":\"number\"},\"bytes\":{\"type\":\"int"

@@ -1,14 +1,13 @@
 // One thread, one PUB socket, one queue a run. Order of a frame: digest, journal, socket; so
 // nothing is ever seen on the wire that a crash could take back.
 //
-// ZeroMQ sends without a copy: a message holds a reference on the frame, and the last one (journal
-// done, every subscriber's pipe done or dropped) frees it. SEND_HIGH_WATER bounds what a stalled
-// subscriber can hold.
+// A frame's memory is free again as soon as the journal has it. What ZeroMQ sends is a mapping of
+// the journal's file, so that subscribers that stall, each at its own frame, hold pages of the file
+// cache and none of the daemon's memory; SEND_HIGH_WATER bounds how many.
 #include "server/publish.h"
 
 #include <errno.h>
 #include <pthread.h>
-#include <stdatomic.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -26,12 +25,8 @@
 
 struct item {
     struct item *next;
-    struct buffer *frame; // or else
+    struct outlet_frame *frame; // or else
     char *event;
-};
-struct buffer {
-    struct outlet_frame public; // first: the handle that the run fills
-    atomic_uint references;
 };
 
 struct outlet {
@@ -63,35 +58,31 @@ struct publisher {
 // ---- Buffers ----------------------------------------------------------------------------------
 
 struct outlet_frame *publish_buffer(size_t bytes) {
-    struct buffer *buffer = calloc(1, sizeof *buffer);
-    if (buffer == NULL)
+    struct outlet_frame *frame = calloc(1, sizeof *frame);
+    if (frame == NULL)
         return NULL;
     size_t rounded = (bytes + FRAME_ALIGN - 1) / FRAME_ALIGN * FRAME_ALIGN;
-    buffer->public.frame = aligned_alloc(FRAME_ALIGN, rounded);
-    if (buffer->public.frame == NULL) {
-        free(buffer);
+    frame->frame = aligned_alloc(FRAME_ALIGN, rounded);
+    if (frame->frame == NULL) {
+        free(frame);
         return NULL;
     }
-    buffer->public.info.bytes = bytes;
-    atomic_init(&buffer->references, 1);
-    return &buffer->public;
-}
-
-static void buffer_release(struct buffer *buffer) {
-    if (atomic_fetch_sub(&buffer->references, 1) == 1) {
-        free(buffer->public.frame);
-        free(buffer);
-    }
+    frame->info.bytes = bytes;
+    return frame;
 }
 
 void publish_drop(struct outlet_frame *frame) {
-    if (frame != NULL)
-        buffer_release((struct buffer *)frame);
+    if (frame == NULL)
+        return;
+    free(frame->frame);
+    free(frame);
 }
 
 static void message_free(void *bytes, void *hint) {
+    struct journal_map *map = hint;
     (void)bytes;
-    buffer_release(hint);
+    journal_frame_unmap(map);
+    free(map);
 }
 
 // ---- The thread -------------------------------------------------------------------------------
@@ -115,12 +106,18 @@ static bool is_past(const struct timespec *t) {
 }
 
 // PUB never blocks; a message that a subscriber's pipe has no room for is dropped for that one.
-static void send_frame(struct publisher *p, const struct outlet *outlet, struct buffer *buffer) {
+static void send_frame(struct publisher *p, const struct outlet *outlet, uint64_t seq) {
     zmq_msg_t message;
-    atomic_fetch_add(&buffer->references, 1);
-    if (zmq_msg_init_data(&message, buffer->public.frame, buffer->public.info.bytes, message_free,
-                          buffer) != 0) {
-        buffer_release(buffer);
+    char why[JOURNAL_WHY];
+    struct journal_map *map = malloc(sizeof *map);
+    if (map == NULL || !journal_frame_map(outlet->journal, seq, map, why)) {
+        log_warn("not_published", "topic=%s seq=%llu why=\"%s\"", outlet->frame_topic,
+                 (unsigned long long)seq, map == NULL ? "out of memory" : why);
+        free(map); // subscribers see the gap and fetch it
+        return;
+    }
+    if (zmq_msg_init_data(&message, map->frame, map->bytes, message_free, map) != 0) {
+        message_free(NULL, map);
         return;
     }
     if (zmq_send(p->socket, outlet->frame_topic, strlen(outlet->frame_topic),
@@ -155,7 +152,8 @@ static struct outlet *next_outlet(struct publisher *p) {
         return NULL;
     do {
         bool failed = o->status == JOURNAL_ERROR;
-        bool waits = o->status == JOURNAL_FULL && !is_past(&o->retry);
+        bool waits =
+            (o->status == JOURNAL_FULL || o->status == JOURNAL_HELD) && !is_past(&o->retry);
         if (o->first != NULL && !waits && !failed)
             return o;
         o = o->next != NULL ? o->next : p->outlets;
@@ -173,17 +171,22 @@ static void work_on(struct publisher *p, struct outlet *o) {
     p->turn = o;
     pthread_mutex_unlock(&p->lock);
     if (item->frame != NULL) {
-        struct outlet_frame *frame = &item->frame->public;
+        struct outlet_frame *frame = item->frame;
         uint64_t gone = journal_n_gone(o->journal);
         frame->info.digest = frame_seal(frame->frame);
         result = journal_append_frame(o->journal, frame->frame, &frame->info, why);
         if (result == JOURNAL_OK) {
             announce_gone(p, o, gone);
-            send_frame(p, o, item->frame);
+            send_frame(p, o, frame->info.seq);
         } else if (strcmp(why, before) != 0 || is_past(&o->log_again)) {
             o->log_again = after(LOG_SECONDS);
-            log_error("journal", "topic=%s seq=%llu full=%d why=\"%s\"", o->frame_topic,
-                      (unsigned long long)frame->info.seq, result == JOURNAL_FULL, why);
+            log_line(result == JOURNAL_HELD ? LOG_LEVEL_WARN : LOG_LEVEL_ERROR, "journal",
+                     "topic=%s seq=%llu result=%s why=\"%s\"", o->frame_topic,
+                     (unsigned long long)frame->info.seq,
+                     result == JOURNAL_HELD   ? "held"
+                     : result == JOURNAL_FULL ? "full"
+                                              : "error",
+                     why);
         }
     } else {
         send_event(p, o, item->event);
@@ -198,7 +201,7 @@ static void work_on(struct publisher *p, struct outlet *o) {
             o->last = NULL;
         if (item->frame != NULL) {
             o->n_frames--;
-            buffer_release(item->frame);
+            publish_drop(item->frame);
         } else {
             o->n_events--;
             free(item->event);
@@ -320,8 +323,7 @@ struct outlet *publish_open(struct publisher *publisher, const char *run, struct
 }
 
 static void item_free(struct item *item) {
-    if (item->frame != NULL)
-        buffer_release(item->frame);
+    publish_drop(item->frame);
     free(item->event);
     free(item);
 }
@@ -369,7 +371,16 @@ void publish_close(struct outlet *o) {
     free(o);
 }
 
+void publish_retry(struct outlet *o) {
+    pthread_mutex_lock(&o->publisher->lock);
+    o->retry = after(0);
+    pthread_cond_signal(&o->publisher->work);
+    pthread_mutex_unlock(&o->publisher->lock);
+}
+
 bool publish_has_room(struct outlet *o) {
+    if (journal_held(o->journal))
+        return false;
     pthread_mutex_lock(&o->publisher->lock);
     bool room = o->n_frames < OUTLET_DEPTH;
     pthread_mutex_unlock(&o->publisher->lock);
@@ -392,7 +403,7 @@ void publish_push(struct outlet *o, struct outlet_frame *frame) {
         o->status = JOURNAL_ERROR;
         snprintf(o->why, sizeof o->why, "out of memory");
     } else {
-        item->frame = (struct buffer *)frame;
+        item->frame = frame;
         o->n_frames++;
         append(o, item);
     }

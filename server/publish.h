@@ -37,7 +37,10 @@ void publish_close(struct outlet *outlet); // what is still queued is dropped
 // Drops what could not be written, of a run that is over.
 void publish_abandon(struct outlet *outlet);
 
+// False also while frames that a recorder has not acknowledged fill the journal's budget.
 bool publish_has_room(struct outlet *outlet);
+// Tries again at once what found no room.
+void publish_retry(struct outlet *outlet);
 // A buffer for a frame of `bytes`, or NULL without memory. Give it back by publish_push or
 // publish_drop.
 struct outlet_frame *publish_buffer(size_t bytes);
@@ -49,7 +52,8 @@ void publish_push(struct outlet *outlet, struct outlet_frame *frame);
 void publish_event(struct outlet *outlet, const char *json);
 
 // How the writing stands: JOURNAL_FULL while a frame waits for room on the disk (it is tried
-// again), JOURNAL_ERROR once it has failed for good; then `why` says why.
+// again), JOURNAL_HELD while it waits for a recorder, JOURNAL_ERROR once it has failed for good;
+// `why` says why.
 enum journal_result publish_status(struct outlet *outlet, char *why);
 // Waits until all that was pushed is in the journal and handed to the socket; false when it is not
 // within `seconds` (< 0: as long as it takes) or the writing failed.

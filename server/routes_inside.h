@@ -26,6 +26,8 @@ void routes_serve_materials(struct call *c);
 void routes_serve_openapi(struct call *c);
 void routes_serve_probes(struct call *c);
 void routes_serve_ready(struct call *c);
+void routes_serve_record(struct call *c);
+void routes_serve_recorders(struct call *c);
 void routes_serve_run(struct call *c);
 void routes_serve_run_scene(struct call *c);
 void routes_serve_runs(struct call *c);
@@ -33,10 +35,15 @@ void routes_serve_scene(struct call *c);
 void routes_serve_scenes(struct call *c);
 void routes_serve_schema(struct call *c);
 void routes_serve_service(struct call *c);
+void routes_serve_unrecord(struct call *c);
 void routes_serve_validate(struct call *c);
 
 // The run that the path names, retained; NULL when the reply is a 404.
 struct run *routes_run_of(struct call *c);
+// The recorders of a run, [{name, acked, lag_frames, lag_bytes, heard_s}], new; and what its
+// journal holds.
+cJSON *routes_recorders_json(struct run *run);
+cJSON *routes_journal_json(struct run *run);
 // A fault for every key of `body` that is not in `known` ("one two").
 void routes_unknown_keys(const cJSON *body, const char *known, struct faults *faults);
 // "must be EXPECTED, got ..." of a member of the body.

@@ -143,7 +143,14 @@ void routes_serve_frames(struct call *c) {
     struct journal_frame frame;
     cJSON *json = cJSON_CreateObject();
     uint64_t first = journal != NULL ? journal_n_gone(journal) : 0;
-    reply_add(json, "first", (double)first); // those before it were dropped for want of room
+    reply_add(json, "first", (double)first);
+    cJSON *gone = cJSON_AddArrayToObject(json, "gone"); // dropped for want of room
+    if (first > 0) {
+        cJSON *range = cJSON_CreateObject();
+        reply_add(range, "from", 0);
+        reply_add(range, "to", (double)first - 1);
+        cJSON_AddItemToArray(gone, range);
+    }
     cJSON *list = cJSON_AddArrayToObject(json, "frames");
     for (uint64_t seq = first; journal != NULL && journal_frame(journal, seq, &frame); seq++) {
         char digest[24];

@@ -125,6 +125,8 @@ static cJSON *run_json(struct run *run) {
     for (unsigned k = 0; k < status.n_warnings; k++)
         cJSON_AddItemToArray(warnings, cJSON_CreateString(status.warnings[k]));
     cJSON_AddItemToObject(json, "changes", run_changes(run));
+    cJSON_AddItemToObject(json, "journal", routes_journal_json(run));
+    cJSON_AddItemToObject(json, "recorders", routes_recorders_json(run));
     cJSON_AddItemToObject(json, "performance", performance_json(&status));
     cJSON_AddItemToObject(json, "balance", balance_json(&status));
     cJSON_AddItemToObject(
@@ -183,10 +185,31 @@ void routes_serve_delete(struct call *c) {
 
 // ---- Creating ---------------------------------------------------------------------------------
 
+static void check_recorders(const cJSON *list, struct run_definition *out, struct faults *faults) {
+    const cJSON *item;
+    char expected[96];
+    if (list == NULL)
+        return;
+    snprintf(expected, sizeof expected, "at most %d names [A-Za-z0-9][A-Za-z0-9._-]{0,63}",
+             RECORDERS_MAX);
+    if (!cJSON_IsArray(list)) {
+        routes_value_fault(faults, "recorders", "type", "an array", list);
+        return;
+    }
+    cJSON_ArrayForEach(item, list) {
+        if (!cJSON_IsString(item) || !runs_id_valid(item->valuestring) ||
+            out->n_recorders == RECORDERS_MAX) {
+            routes_value_fault(faults, "recorders", "pattern", expected, list);
+            return;
+        }
+        out->recorders[out->n_recorders++] = item->valuestring;
+    }
+}
+
 static void check_create(const cJSON *body, struct run_definition *out, struct faults *faults) {
     const cJSON *id = json_member(body, "id"), *start = json_member(body, "start");
     const cJSON *wait = json_member(body, "wait_subscribers");
-    routes_unknown_keys(body, "scene overrides id start wait_subscribers", faults);
+    routes_unknown_keys(body, "scene overrides id start wait_subscribers recorders", faults);
     if (id != NULL && !cJSON_IsString(id))
         faults_add(faults, "/id", "type", "string", routes_type_name(id), "must be a string");
     else if (id != NULL && !runs_id_valid(id->valuestring))
@@ -197,6 +220,7 @@ static void check_create(const cJSON *body, struct run_definition *out, struct f
         faults_add(faults, "/start", "type", "boolean", routes_type_name(start),
                    "must be true or false");
     out->start = start == NULL || cJSON_IsTrue(start);
+    check_recorders(json_member(body, "recorders"), out, faults);
     if (wait == NULL)
         return;
     if (!cJSON_IsNumber(wait) || wait->valuedouble < 0 ||

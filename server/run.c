@@ -106,6 +106,9 @@ const char *run_created(const struct run *r) {
 struct journal *run_journal(struct run *r) {
     return r->journal;
 }
+struct recorders *run_recorders(struct run *r) {
+    return r->recorders;
+}
 const struct run_reference *run_references(const struct run *r, size_t *count) {
     *count = r->meta.n_references;
     return r->meta.references;
@@ -189,6 +192,12 @@ void run_command(struct run *r, struct run_command *command) {
         publish_flush(r->outlet, 10);
 }
 
+void run_nudge(struct run *r) {
+    if (r->outlet != NULL)
+        publish_retry(r->outlet);
+    wake(r);
+}
+
 void run_ask_to_stop(struct run *r) {
     atomic_store(&r->stop, true);
     wake(r);
@@ -249,6 +258,7 @@ static void run_free(struct run *r) {
     scene_free(r->scene);
     cJSON_Delete(r->scene_json);
     series_free(r->series);
+    recorders_free(r->recorders);
     journal_close(r->journal);
     cJSON_Delete(r->changes);
     cJSON_Delete(r->replay.scene);
@@ -358,7 +368,12 @@ struct run *run_create(const struct run_host *host, const struct run_definition 
     if (r->journal == NULL)
         goto fail;
     journal_budget(r->journal, (uint64_t)r->config.output.journal_bytes);
-    bool made = journal_append_event(r->journal, event, why) == JOURNAL_OK;
+    r->recorders = recorders_open(r->journal, why);
+    bool made = r->recorders != NULL &&
+                journal_power(r->journal, r->config.output.durability_power, why) == JOURNAL_OK &&
+                journal_append_event(r->journal, event, why) == JOURNAL_OK;
+    for (size_t k = 0; made && k < definition->n_recorders; k++)
+        made = recorders_put(r->recorders, definition->recorders[k], -1, why) == RECORDERS_OK;
     if (made && definition->start) // here and not in its thread, so that first come is first served
         slots_ask(host->slots, &r->slot, r->sim_bytes);
     if (!made || !begin_thread(r)) {
@@ -417,6 +432,9 @@ static bool restore_files(struct run *r, char *why) {
     }
     r->journal = journal_open(r->host->data_dir, r->id, why);
     if (r->journal == NULL)
+        return false;
+    r->recorders = recorders_open(r->journal, why);
+    if (r->recorders == NULL)
         return false;
     if (journal_cut_bytes(r->journal) > 0)
         log_warn("torn_tail_cut", "run=%s bytes=%llu", r->id,
@@ -535,6 +553,7 @@ static bool restore_live(struct run *r, enum run_restore how) {
     r->now.eta_s = NAN;
     r->now.epoch = r->history.epoch;
     journal_budget(r->journal, (uint64_t)r->config.output.journal_bytes);
+    run_power(r);
     if (was != RUN_PAUSED && how == RUN_RESTORE_PAUSE) {
         char why[JOURNAL_WHY];
         cJSON *event = history_event("state", &r->now);
@@ -556,6 +575,8 @@ struct run *run_restore(const struct run_host *host, const char *id, enum run_re
     bool live = false;
     if (!restore_files(r, why)) {
         restore_failed(r, "journal", why);
+        recorders_free(r->recorders);
+        r->recorders = NULL;
         journal_close(r->journal);
         r->journal = NULL;
     } else if (r->history.has_state && run_state_is_final(r->history.state)) {

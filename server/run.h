@@ -9,6 +9,7 @@
 
 #include "server/journal.h"
 #include "server/publish.h"
+#include "server/recorders.h"
 #include "server/scene.h"
 #include "server/series.h"
 #include "server/slots.h"
@@ -120,6 +121,8 @@ struct run_definition {
     const char *name;    // of the scene: a built-in's name, or the inline scene's title
     struct scene *scene; // valid; the run owns it once it is created
     bool start;
+    const char *recorders[RECORDERS_MAX]; // registered before its first frame
+    size_t n_recorders;
 };
 // A new run with its folder and its thread. NULL with a sentence in `why`; then the scene is still
 // the caller's.
@@ -142,9 +145,11 @@ const char *run_created(const struct run *run); // RFC 3339
 struct run_status run_status(struct run *run);
 char *run_scene_text(struct run *run);                      // JSON as run; the caller frees it
 char *run_config_text(struct run *run, uint64_t *revision); // the settable part of it
-cJSON *run_changes(struct run *run);          // [{step, time, patch}] of the configuration; new
-struct series *run_series(struct run *run);   // NULL before there are probes
-struct journal *run_journal(struct run *run); // NULL when its folder is damaged
+cJSON *run_changes(struct run *run);              // [{step, time, patch}] of the configuration; new
+struct series *run_series(struct run *run);       // NULL before there are probes
+struct journal *run_journal(struct run *run);     // NULL when its folder is damaged
+struct recorders *run_recorders(struct run *run); // likewise
+void run_nudge(struct run *run); // a recorder has acknowledged frames or is gone: there may be room
 const struct run_reference *run_references(const struct run *run, size_t *count);
 
 enum run_outcome {

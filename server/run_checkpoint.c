@@ -20,12 +20,19 @@ enum journal_result run_checkpoint(struct run *r, char *why) {
     if (r->has_checkpoint && r->checkpoint_step == r->now.step &&
         r->checkpoint_revision == r->now.revision)
         return JOURNAL_OK;
-    // A checkpoint must not be ahead of the frames and samples that it counts.
-    if (!publish_flush(r->outlet, CHECKPOINT_FLUSH)) {
+    // A checkpoint must not be ahead of the frames and samples that it counts: those on their way
+    // are written even where a recorder holds the budget; no other is taken before there is room.
+    journal_overdraw(r->journal, true);
+    publish_retry(r->outlet);
+    bool flushed = publish_flush(r->outlet, CHECKPOINT_FLUSH);
+    journal_overdraw(r->journal, r->ending != RUN_N_STATES);
+    if (!flushed) {
         snprintf(why, JOURNAL_WHY, "the journal of frames cannot be written");
         return JOURNAL_FULL;
     }
     int error = series_flush(r->series);
+    if (error == 0)
+        error = series_sync(r->series);
     if (error != 0) {
         snprintf(why, JOURNAL_WHY, "the probes' log cannot be written: %s", strerror(error));
         return error == ENOSPC ? JOURNAL_FULL : JOURNAL_ERROR;
@@ -37,6 +44,7 @@ enum journal_result run_checkpoint(struct run *r, char *why) {
     cJSON_AddItemToObject(json, "status", history_status(&status));
     cJSON_AddNumberToObject(json, "next_frame", (double)r->next_seq);
     cJSON_AddNumberToObject(json, "events", (double)journal_n_events(r->journal));
+    cJSON_AddNumberToObject(json, "rows", (double)series_n_rows(r->series));
     cJSON_AddBoolToObject(json, "due", r->due);
     char *meta = json_print(json, false);
     enum journal_result result = JOURNAL_ERROR;
@@ -76,7 +84,13 @@ static bool load_checkpoint(struct run *r, int which, bool *spoiled) {
         return false;
     cJSON *json = json_parse(meta, strlen(meta), &faults);
     const cJSON *next = json_member(json, "next_frame"), *events = json_member(json, "events");
-    bool valid = cJSON_IsNumber(next) && cJSON_IsNumber(events) &&
+    const cJSON *rows = json_member(json, "rows");
+    size_t n_rows = r->series != NULL ? series_n_rows(r->series) : 0;
+    // Frames, events or samples that it counts and that are gone (a power failure, a damaged file)
+    // would be missing for ever if the run went on from here.
+    bool valid = cJSON_IsNumber(next) && cJSON_IsNumber(events) && cJSON_IsNumber(rows) &&
+                 rows->valuedouble <= (double)n_rows &&
+                 events->valuedouble <= (double)journal_n_events(r->journal) &&
                  history_status_read(json_member(json, "status"), &status) &&
                  next->valuedouble <= (double)journal_n_frames(r->journal);
     if (valid && mpm_state_load(r->sim, state, bytes, &error) != MPM_OK) {

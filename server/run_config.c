@@ -37,12 +37,21 @@ static bool change_apply(struct run *r, const struct scene_config *next, unsigne
     return status == MPM_OK;
 }
 
+void run_power(struct run *r) {
+    char why[JOURNAL_WHY];
+    if (journal_power(r->journal, r->config.output.durability_power, why) == JOURNAL_OK)
+        return;
+    run_warn(&r->now, "what is recorded may not survive a power failure: %.150s", why);
+    log_error("durability", "run=%s why=\"%s\"", r->id, why);
+}
+
 static void config_adopt(struct run *r, cJSON *patched, const struct scene_config *next) {
     cJSON_Delete(r->scene_json);
     r->scene_json = patched;
     r->config = *next;
     r->now.n_warnings = 0;
     journal_budget(r->journal, (uint64_t)next->output.journal_bytes);
+    run_power(r);
     if (r->sim != NULL)
         run_schedule(r);
 }

@@ -11,6 +11,7 @@
 #include "server/log.h"
 #include "server/run_inside.h"
 
+#define WARNING_PROBES "the probes' log cannot be written"
 #define FLUSH_SECONDS 1.0 // between two writes of the probes' log
 #define FLUSH_ROWS 1024
 #define TIME_SLACK 1e-9 // of dt: a fixed dt hits its frame times exactly
@@ -60,8 +61,9 @@ void run_sample(struct run *r) {
         run_begin_epoch(r, "the continued run's probes differ from those of the run before");
     if (series_unsaved(r->series) >= FLUSH_ROWS || t - r->last_flush > FLUSH_SECONDS) {
         int error = series_flush(r->series);
+        run_unwarn(&r->now, WARNING_PROBES);
         if (error != 0)
-            run_warn(&r->now, "the probes' log cannot be written: %s", strerror(error));
+            run_warn(&r->now, WARNING_PROBES ": %s", strerror(error));
         r->last_flush = t;
     }
     run_account(r, RUN_PHASE_PROBES, t);
@@ -92,7 +94,7 @@ bool run_series_prepare(struct run *r) {
         fresh = series_create(n, names, counts, components);
         journal_path(r->journal, "probes.log", path, sizeof path);
         if (fresh != NULL && series_save_as(fresh, path, why) != 0)
-            run_warn(&r->now, "the probes' log cannot be written: %.150s", why);
+            run_warn(&r->now, WARNING_PROBES ": %.150s", why);
     }
     free(r->row);
     r->row = calloc(columns + 1, sizeof *r->row);

@@ -20,7 +20,8 @@ struct run {
     const struct run_host *host;
     char id[RUN_ID_MAX + 1];
     struct history_meta meta;
-    struct journal *journal; // NULL: the folder is damaged
+    struct journal *journal;     // NULL: the folder is damaged
+    struct recorders *recorders; // NULL with the journal
     struct outlet *outlet;
     struct slot slot;
     pthread_t thread;
@@ -116,6 +117,7 @@ void run_frame_take(struct run *run, enum run_state state, bool end);
 struct outlet_frame *run_frame_again(struct run *run, enum run_state state);
 
 // ---- run_config.c
+void run_power(struct run *run); // the journal's durability as configured; warns where it fails
 enum run_outcome run_configure(struct run *run, struct run_command *command);
 const struct history_change *run_change_due(const struct run *run); // NULL when there is none
 void run_change_next(struct run *run);                              // makes it again

@@ -14,7 +14,7 @@
 #include "server/log.h"
 #include "server/run_inside.h"
 
-#define WARNING_DISK "waits for room on the disk"
+#define WARNING_ROOM "waits for room "
 #define PUBLISH_SECONDS 0.02 // between two copies of the status
 #define WAITING_SECONDS 0.25 // a shorter wait for the disk is not worth a change of state
 #define CHECKPOINT_FLUSH 5.0 // s to wait for frames on their way before a checkpoint is given up
@@ -126,7 +126,10 @@ static enum run_outcome snapshot(struct run *r, struct run_command *c) {
         return RUN_BUSY;
     }
     if (r->next_seq < r->replay.end || !publish_has_room(r->outlet)) {
-        snprintf(c->why, sizeof c->why, "frames are still on their way to the disk");
+        snprintf(c->why, sizeof c->why, "%s",
+                 journal_held(r->journal)
+                     ? "the journal is full of frames that a recorder has not acknowledged"
+                     : "frames are still on their way to the disk");
         return RUN_BUSY;
     }
     // Idempotent: what is there already of this very step is not taken again.
@@ -223,16 +226,48 @@ static void obey(struct run *r) {
 
 // ---- The end ----------------------------------------------------------------------------------
 
+// Also while a recorder holds the budget: at the end of a run that is no obstacle.
 static bool journal_works(struct run *r) {
     char why[JOURNAL_WHY];
-    return publish_status(r->outlet, why) == JOURNAL_OK;
+    enum journal_result status = publish_status(r->outlet, why);
+    return status == JOURNAL_OK || status == JOURNAL_HELD;
+}
+
+// The probes are in their log before the run is over. Where the disk has no room that is waited for
+// (but not by an end by force); another fault is the run's.
+static bool probes_safe(struct run *r) {
+    int error = series_flush(r->series);
+    if (error == 0 && r->config.output.durability_power)
+        error = series_sync(r->series);
+    if (error == 0 || r->ending != RUN_COMPLETED)
+        return true;
+    bool full = error == ENOSPC || error == EDQUOT;
+    if (!full || !r->config.output.when_full_block) {
+        char why[JOURNAL_WHY];
+        snprintf(why, sizeof why, "the probes' log cannot be written: %s", strerror(error));
+        run_fail(r, "journal", "look at the disk of the data folder", why);
+    } else {
+        run_unwarn(&r->now, WARNING_ROOM);
+        run_warn(&r->now, WARNING_ROOM "on the disk: the probes' log cannot be written");
+    }
+    return false;
 }
 
 // Takes the last frame. False when it has to wait for the disk.
 static bool end_push(struct run *r) {
     char why[JOURNAL_WHY];
-    if (!journal_works(r))
-        return r->ending != RUN_COMPLETED; // an end by force does not wait for the disk
+    enum journal_result status = publish_status(r->outlet, why);
+    if (!journal_works(r) && r->ending != RUN_COMPLETED)
+        return true; // an end by force does not wait for the disk
+    if (status == JOURNAL_ERROR || (status == JOURNAL_FULL && !r->config.output.when_full_block)) {
+        run_fail(r, "journal", "look at the disk of the data folder", why);
+        return false;
+    }
+    run_unwarn(&r->now, WARNING_ROOM);
+    if (status == JOURNAL_FULL)
+        run_warn(&r->now, WARNING_ROOM "on the disk: %.150s", why);
+    if (status != JOURNAL_OK)
+        return false;
     bool from_sim = r->sim != NULL && r->ending != RUN_FAILED;
     if (!publish_has_room(r->outlet) || (!from_sim && !publish_flush(r->outlet, 0)))
         return false;
@@ -241,7 +276,8 @@ static bool end_push(struct run *r) {
         if (ending == RUN_CANCELLED)
             run_checkpoint(r, why);
         run_sample(r);
-        series_flush(r->series);
+        if (!probes_safe(r))
+            return false;
         run_frame_take(r, ending, true);
         if (r->ending != ending) // no memory for it
             return false;
@@ -270,7 +306,7 @@ static void finish(struct run *r) {
     if (!r->end_pushed || (!publish_flush(r->outlet, 0) && !forced))
         return;
     run_wall_leave(r);
-    run_unwarn(&r->now, WARNING_DISK);
+    run_unwarn(&r->now, WARNING_ROOM);
     run_status_fill(r, r->ending != RUN_FAILED);
     struct run_status last = run_status_until_now(r);
     last.state = r->ending;
@@ -309,20 +345,43 @@ static void wait_for_knock(struct run *r, double seconds) {
     pthread_mutex_unlock(&r->lock);
 }
 
-// A frame is due and the queue to the disk is full.
-static void wait_for_disk(struct run *r) {
-    char why[JOURNAL_WHY];
+// "recorder NAME, silent for 12 s, has acknowledged frame 3 of 80"
+static void explain_held(struct run *r, char *out) {
+    struct recorder slowest;
+    if (recorders_slowest(r->recorders, &slowest))
+        snprintf(out, JOURNAL_WHY,
+                 "recorder %s, silent for %.0f s, has acknowledged %lld of %llu frames",
+                 slowest.name, slowest.heard, (long long)slowest.acked + 1,
+                 (unsigned long long)journal_n_frames(r->journal));
+}
+
+// A frame is due and there is no room: the disk is behind or full, or a recorder is behind.
+static void wait_for_room(struct run *r) {
+    char why[JOURNAL_WHY] = "";
     enum journal_result status = publish_status(r->outlet, why);
+    if (status == JOURNAL_HELD || (status == JOURNAL_OK && journal_held(r->journal))) {
+        status = JOURNAL_HELD;
+        explain_held(r, why);
+    }
     run_wall_wait(r);
     if (status == JOURNAL_ERROR) {
         run_fail(r, "journal", "look at the disk of the data folder", why);
     } else if (status == JOURNAL_FULL && !r->config.output.when_full_block) {
         run_fail(r, "journal", "make room on the disk, or set output.when_full to \"block\"", why);
+    } else if (status == JOURNAL_HELD && !r->config.output.when_full_block) {
+        run_fail(r, "journal",
+                 "record faster, raise output.journal_bytes, or set output.when_full to \"block\"",
+                 why);
     } else {
+        run_unwarn(&r->now, WARNING_ROOM);
         if (status == JOURNAL_FULL)
-            run_warn(&r->now, WARNING_DISK ": %.150s", why);
+            run_warn(&r->now, WARNING_ROOM "on the disk: %.150s", why);
+        else if (status == JOURNAL_HELD)
+            run_warn(&r->now, WARNING_ROOM "in the journal: %.150s", why);
         if (r->now.state == RUN_RUNNING && run_clock() - r->wait_from > WAITING_SECONDS)
             run_state_enter(r, RUN_WAITING);
+        else if (run_clock() - r->last_published >= PUBLISH_SECONDS)
+            run_status_publish(r, false);
         wait_for_knock(r, 0.05);
         run_boundary(r);
     }
@@ -335,10 +394,10 @@ static void advance(struct run *r) {
     if (r->due) {
         run_boundary(r);
         if (r->due) {
-            wait_for_disk(r);
+            wait_for_room(r);
             return;
         }
-        run_unwarn(&r->now, WARNING_DISK);
+        run_unwarn(&r->now, WARNING_ROOM);
     }
     if (r->now.state == RUN_WAITING)
         run_state_enter(r, RUN_RUNNING);
@@ -372,6 +431,8 @@ static void turn(struct run *r) {
         finish(r);
         if (!run_state_is_final(r->now.state)) {
             run_wall_wait(r);
+            if (r->now.state == RUN_RUNNING && run_clock() - r->wait_from > WAITING_SECONDS)
+                run_state_enter(r, RUN_WAITING);
             wait_for_knock(r, 0.05);
         }
         return;
@@ -397,7 +458,7 @@ static void turn(struct run *r) {
             if (r->due && r->sim != NULL)
                 run_boundary(r);
             if (!r->due)
-                run_unwarn(&r->now, WARNING_DISK);
+                run_unwarn(&r->now, WARNING_ROOM);
             wait_for_knock(r, r->due ? 0.2 : 60);
         }
         break;

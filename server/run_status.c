@@ -222,6 +222,10 @@ void run_end_with(struct run *r, enum run_state state) {
     if (r->ending == RUN_N_STATES)
         r->end_pushed = false;
     r->ending = state;
+    // The few frames on their way and the last one go over the budget where a recorder holds it:
+    // after them there is nothing that could wait for it.
+    journal_overdraw(r->journal, true);
+    publish_retry(r->outlet);
 }
 
 void run_fail(struct run *r, const char *kind, const char *advice, const char *detail) {

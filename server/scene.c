@@ -126,6 +126,7 @@ static void read_output(const cJSON *root, struct scene_output *output) {
         .checkpoint_interval = number(json, "checkpoint_interval"),
         .journal_bytes = number(json, "journal_bytes"),
         .when_full_block = text_is(json, "when_full", "block"),
+        .durability_power = text_is(json, "durability", "power"),
     };
     const cJSON *fields = json_member(json, "fields");
     for (const cJSON *field = fields->child; field; field = field->next)

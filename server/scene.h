@@ -12,6 +12,7 @@ struct scene_output {
     double checkpoint_interval; // s of wall time
     double journal_bytes;       // budget of the frames on disk
     bool when_full_block;       // true "block", false "fail"
+    bool durability_power;      // true "power", false "process"
     size_t n_fields;
     enum mpm_field fields[MPM_N_FIELDS]; // always begins with position
 };

@@ -232,7 +232,8 @@ static const struct scene_key output_keys[] = {
     {"journal_bytes",
      {.type = SCENE_INTEGER, .unit = "byte", .min = 1e6, .max = 1e15},
      .fallback = "4294967296",
-     .doc = "room for frames that a recorder has not acknowledged"},
+     .doc = "room for frames on the disk; beyond it the oldest go, but for those that a "
+            "recorder has not acknowledged"},
     {"when_full", CHOICE(when_full), .fallback = "\"block\"",
      .doc = "what happens when that room is full: the run waits, or it fails"},
     {"durability", CHOICE(durability), .fallback = "\"process\"",

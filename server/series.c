@@ -26,6 +26,7 @@ struct series {
     pthread_mutex_t lock; // over what follows
     double *rows;         // (n_rows, 2 + n_columns): step as bits, time, values
     size_t n_rows, capacity, n_saved;
+    char *path; // of the log that is to be, where it could not be begun yet
     int fd;
     off_t saved_bytes;
     size_t header_bytes;
@@ -85,6 +86,7 @@ void series_free(struct series *s) {
     }
     free(s->probes);
     free(s->rows);
+    free(s->path);
     if (s->fd >= 0)
         close(s->fd);
     pthread_mutex_destroy(&s->lock);
@@ -122,31 +124,52 @@ static char *header_text(const struct series *s) {
     return text;
 }
 
-int series_save_as(struct series *s, const char *path, char *why) {
-    char *text = header_text(s);
-    int fd = open(path, O_RDWR | O_CREAT | O_TRUNC | O_CLOEXEC, 0600);
-    if (text == NULL || fd < 0) {
-        snprintf(why, JOURNAL_WHY, "%.400s: %s", path, strerror(fd < 0 ? errno : ENOMEM));
-        free(text);
-        if (fd >= 0)
-            close(fd);
-        return -1;
+// 0 or errno.
+static int write_at(int fd, const void *from, size_t n, off_t at) {
+    size_t done = 0;
+    while (done < n) {
+        ssize_t wrote = pwrite(fd, (const char *)from + done, n - done, at + (off_t)done);
+        if (wrote < 0 && errno != EINTR)
+            return errno;
+        if (wrote == 0)
+            return EIO;
+        done += wrote > 0 ? (size_t)wrote : 0;
     }
-    uint32_t n = (uint32_t)strlen(text);
+    return 0;
+}
+
+// A new log at s->path; 0 or errno.
+static int log_begin(struct series *s) {
+    char *text = header_text(s);
+    int fd = open(s->path, O_RDWR | O_CREAT | O_TRUNC | O_CLOEXEC, 0600);
+    int error = text == NULL ? ENOMEM : fd < 0 ? errno : 0;
+    uint32_t n = text != NULL ? (uint32_t)strlen(text) : 0;
     unsigned char preamble[PREAMBLE] = LOG_MAGIC;
     memcpy(preamble + 8, &n, sizeof n);
-    bool whole = write(fd, preamble, PREAMBLE) == PREAMBLE && write(fd, text, n) == (ssize_t)n;
+    if (error == 0)
+        error = write_at(fd, preamble, PREAMBLE, 0);
+    if (error == 0)
+        error = write_at(fd, text, n, PREAMBLE);
     free(text);
-    if (!whole) {
-        snprintf(why, JOURNAL_WHY, "%.400s: %s", path, strerror(errno));
-        close(fd);
-        return -1;
+    if (error != 0) {
+        if (fd >= 0)
+            close(fd);
+        return error;
     }
     s->fd = fd;
     s->header_bytes = PREAMBLE + n;
     s->saved_bytes = (off_t)s->header_bytes;
     s->n_saved = 0;
     return 0;
+}
+
+int series_save_as(struct series *s, const char *path, char *why) {
+    free(s->path);
+    s->path = strdup(path);
+    int error = s->path != NULL ? log_begin(s) : ENOMEM;
+    if (error != 0)
+        snprintf(why, JOURNAL_WHY, "%.400s: %s", path, strerror(error));
+    return error != 0 ? -1 : 0;
 }
 
 static struct series *series_from_header(const char *text, size_t n) {
@@ -253,8 +276,8 @@ int series_flush(struct series *s) {
     pthread_mutex_lock(&s->lock);
     size_t n = s->n_rows - s->n_saved, size = log_row_bytes(s), data = size - sizeof(uint64_t);
     char *block = NULL;
-    int error = 0;
-    if (n > 0 && s->fd >= 0) {
+    int error = s->fd < 0 && s->path != NULL ? log_begin(s) : 0;
+    if (error == 0 && n > 0 && s->fd >= 0) {
         block = malloc(n * size);
         error = block == NULL ? ENOMEM : 0;
     }
@@ -269,13 +292,7 @@ int series_flush(struct series *s) {
         return error;
     // Only the appending thread flushes, so that the rows stay; readers are not held up by the
     // disk.
-    size_t done = 0;
-    while (error == 0 && done < n * size) {
-        ssize_t wrote = pwrite(s->fd, block + done, n * size - done, at + (off_t)done);
-        if (wrote < 0 && errno != EINTR)
-            error = errno;
-        done += wrote > 0 ? (size_t)wrote : 0;
-    }
+    error = write_at(s->fd, block, n * size, at);
     free(block);
     pthread_mutex_lock(&s->lock);
     if (error == 0) {
@@ -284,6 +301,10 @@ int series_flush(struct series *s) {
     }
     pthread_mutex_unlock(&s->lock);
     return error;
+}
+
+int series_sync(struct series *s) {
+    return s->fd >= 0 && fdatasync(s->fd) != 0 ? errno : 0;
 }
 
 size_t series_unsaved(struct series *s) {

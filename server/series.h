@@ -30,7 +30,7 @@ size_t series_n_columns(const struct series *series);
 const struct series_probe *series_probe(const struct series *series, size_t index);
 
 // The log: a new file, or an existing one whose torn tail is cut. 0, or -1 with a sentence in `why`
-// (JOURNAL_WHY bytes).
+// (JOURNAL_WHY bytes); a new file that cannot be begun now is tried again by series_flush.
 int series_save_as(struct series *series, const char *path, char *why);
 struct series *series_load(const char *path, char *why);
 
@@ -41,6 +41,7 @@ enum series_verdict series_append(struct series *series, uint64_t step, double t
                                   const double *values);
 // Writes to the log what has been appended since; 0 or errno.
 int series_flush(struct series *series);
+int series_sync(struct series *series); // what was flushed survives a power failure; 0 or errno
 size_t series_unsaved(struct series *series); // rows
 
 size_t series_n_rows(struct series *series);

@@ -32,7 +32,7 @@ for hit in $(grep -rlE '#include "server/mpm/' server --include='*.[ch]' | grep 
 done
 only 'microhttpd.h' 'server/http\.[ch]' 'only http.c knows libmicrohttpd'
 only 'zmq.h' '(server/publish|client/subscribe)\.c' 'only the two ends of the socket know ZeroMQ'
-only 'hdf5.h' 'client/store\.c' 'only store.c knows HDF5'
+only 'hdf5.h' 'client/store(_read)?\.c' 'only store.c and store_read.c know HDF5'
 only 'curl/' 'client/request\.c' 'only request.c knows libcurl'
 for hit in $(grep -rnE '\b(printf|fprintf|fopen|getenv|exit|clock_gettime|time)\(' server/mpm --include='*.c' |
     grep -v snprintf | cut -d: -f1,2); do

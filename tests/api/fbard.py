@@ -114,6 +114,7 @@ class Daemon:
         self.process = None
         self.token = None
         self.starts = 0
+        self.environment = {}
 
     # ---- The process ----
 
@@ -131,7 +132,7 @@ class Daemon:
         self.log = self.folder / f"stderr-{self.starts}.txt"
         with open(self.log, "wb") as log:
             suppressions = pathlib.Path(__file__).with_name("tsan.supp")
-            environment = {"TSAN_OPTIONS": f"suppressions={suppressions}", **os.environ}
+            environment = {"TSAN_OPTIONS": f"suppressions={suppressions}", **os.environ, **self.environment}
             self.process = subprocess.Popen(self.command(), stdin=subprocess.DEVNULL, stdout=log, stderr=log,
                                             env=environment)  # fmt: skip
 

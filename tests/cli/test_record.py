@@ -261,6 +261,45 @@ def test_recover_builds_a_file_without_a_daemon(fbar, fake, start_fbar, tmp_path
     assert fbar("recover", "missing.h5").returncode == 4
 
 
+def test_record_resumed_while_the_daemon_is_away_waits_for_it(fbar, fake, start_fbar, tmp_path):
+    wanted = undisturbed(fbar, fake, tmp_path)
+    daemon = partial(fbar, fake, start_fbar, tmp_path)
+    daemon.down()
+    recorder = start_fbar("record", "r1", "-o", "a.h5", url=daemon.url)
+    time.sleep(0.5)
+    assert recorder.poll() is None
+    daemon.up()
+    daemon.advance(14, live=False)
+    _, err = recorder.communicate(timeout=20)
+    assert recorder.returncode == 0 and "is back" in err, err
+    assert (tmp_path / "a.h5").read_bytes() == wanted
+    daemon.down()  # with nothing recorded there is nothing to wait for
+    assert fbar("record", "r1", "-o", "b.h5", url=daemon.url).returncode == 3
+    daemon.up()
+
+
+def test_record_ahead_of_a_daemon_that_lost_frames_registers_from_the_start(fbar, fake, start_fbar, tmp_path):
+    """After a power failure the daemon may know fewer frames than are safe here; it makes them again."""
+    wanted = undisturbed(fbar, fake, tmp_path)
+    daemon = partial(fbar, fake, start_fbar, tmp_path, n=6)
+    daemon.ready, known, route = 3, len(daemon.acks), daemon.route
+    refused = (422, "application/problem+json", b'{"title": "x", "status": 422, "detail": "x", "errors": []}')
+
+    def strict(method, path, body, headers):
+        ahead = method == "PUT" and "/recorders/" in path and json.loads(body)["acked"] >= daemon.ready
+        return refused if ahead else route(method, path, body, headers)
+
+    daemon.route = strict
+    recorder = start_fbar("record", "r1", "-o", "a.h5", url=daemon.url)
+    wait_until(lambda: len(daemon.acks) > known)
+    assert daemon.acks[known:] == [-1], "registered, with nothing acknowledged"
+    daemon.play()
+    _, err = recorder.communicate(timeout=20)
+    assert recorder.returncode == 0, err
+    assert daemon.acks[-1] == 19
+    assert (tmp_path / "a.h5").read_bytes() == wanted
+
+
 def test_record_interrupted_closes_the_file_and_resumes(fbar, fake, start_fbar, tmp_path):
     daemon = fake()
     recorder = start_fbar("record", "r1", "-o", "a.h5", url=daemon.url)

@@ -16,6 +16,7 @@
 
 #include "proto/frame.h"
 #include "server/journal.h"
+#include "server/recorders.h"
 #include "server/series.h"
 
 static char folder[64], why[JOURNAL_WHY];
@@ -226,9 +227,174 @@ static void test_journal_cuts_half_an_event(void **state) {
     journal = journal_open(folder, "e", why);
     assert_non_null(journal);
     journal_append_event(journal, "{\"event\":\"three\"}", why);
+    assert_int_equal(journal_n_events(journal), 2);
     char *text = journal_text(journal, "events.jsonl", &bytes);
-    assert_string_equal(text, "{\"event\":\"one\"}\n{\"event\":\"three\"}\n");
+    char *second = strchr(text, '\n') + 1;
+    const char one[] = "{\"event\":\"one\",\"check\":\"",
+               three[] = "{\"event\":\"three\",\"check\":\"";
+    assert_memory_equal(text, one, sizeof one - 1);
+    assert_memory_equal(second, three, sizeof three - 1);
+    assert_ptr_equal(strchr(second, '\n'), text + bytes - 1);
     free(text);
+    journal_close(journal);
+}
+
+// Every single byte: none can be changed, and no line be taken out, without its place being named.
+static void test_journal_refuses_a_changed_event(void **state) {
+    char path[256], wanted[32];
+    size_t bytes;
+    (void)state;
+    struct journal *journal = fresh("ec");
+    for (int k = 0; k < 3; k++) {
+        char event[32];
+        snprintf(event, sizeof event, "{\"event\":\"number %d\"}", k);
+        assert_int_equal(journal_append_event(journal, event, why), JOURNAL_OK);
+    }
+    char *text = journal_text(journal, "events.jsonl", &bytes);
+    journal_close(journal);
+    snprintf(path, sizeof path, "%s/runs/ec/events.jsonl", folder);
+    int fd = open(path, O_RDWR), line = 1;
+    for (size_t at = 0; at < bytes; at++) {
+        char changed = text[at] ^ 1;
+        assert_int_equal(pwrite(fd, &changed, 1, (off_t)at), 1);
+        if (at + 1 < bytes) { // the very last byte is the end of the last line: a torn tail
+            assert_null(journal_open(folder, "ec", why));
+            snprintf(wanted, sizeof wanted, "damaged line %d", line);
+            assert_non_null(strstr(why, wanted));
+        }
+        assert_int_equal(pwrite(fd, text + at, 1, (off_t)at), 1);
+        line += text[at] == '\n';
+    }
+    char *second = strchr(text, '\n') + 1, *third = strchr(second, '\n') + 1;
+    size_t tail = bytes - (size_t)(third - text);
+    assert_int_equal(pwrite(fd, third, tail, second - text), tail);
+    assert_int_equal(ftruncate(fd, (second - text) + (off_t)tail), 0);
+    close(fd);
+    assert_null(journal_open(folder, "ec", why));
+    assert_non_null(strstr(why, "damaged line 2"));
+    free(text);
+}
+
+// What a recorder has not acknowledged stays, whatever the budget; then there is no room, but for
+// the last frames of a run; and what it acknowledges makes room.
+static void test_journal_keeps_what_is_not_acknowledged(void **state) {
+    (void)state;
+    struct journal *journal = fresh("k");
+    const size_t count = 1000; // 16 kB a frame
+    struct journal_frame info;
+    journal_budget(journal, 400000);
+    journal_keep(journal, 0);
+    uint64_t n = 0;
+    void *frame = make_frame(n, count, &info);
+    while (journal_append_frame(journal, frame, &info, why) == JOURNAL_OK) {
+        free(frame);
+        frame = make_frame(++n, count, &info);
+        assert_true(n < 60);
+    }
+    assert_int_equal(journal_append_frame(journal, frame, &info, why), JOURNAL_HELD);
+    assert_int_equal(n, journal_n_frames(journal));
+    assert_int_equal(journal_n_gone(journal), 0);
+    assert_true(journal_frame_bytes(journal) <= 400000 && n > 400000 / 20000);
+    journal_overdraw(journal, true);
+    assert_int_equal(journal_append_frame(journal, frame, &info, why), JOURNAL_OK);
+    assert_false(journal_held(journal));
+    journal_overdraw(journal, false);
+    assert_true(journal_held(journal));
+    free(frame);
+    frame = make_frame(n + 1, count, &info);
+    assert_int_equal(journal_append_frame(journal, frame, &info, why), JOURNAL_HELD);
+    for (uint64_t keep = 0; journal_append_frame(journal, frame, &info, why) != JOURNAL_OK;
+         keep++) {
+        assert_true(keep <= n);
+        journal_keep(journal, keep);
+        assert_true(journal_n_gone(journal) <= keep);
+    }
+    assert_true(journal_n_gone(journal) > 0);
+    for (uint64_t seq = journal_n_gone(journal); seq < n; seq++)
+        assert_frame_reads(journal, seq, count);
+    free(frame);
+    // All acknowledged: even where the newest segment alone fills the budget there is room.
+    journal_budget(journal, 20000);
+    for (uint64_t seq = n + 2; seq < n + 8; seq++) {
+        journal_keep(journal, seq);
+        append_frames(journal, seq, seq + 1, count);
+    }
+    journal_close(journal);
+}
+
+// Mapped frames are those of the journal, and outlive their segment.
+static void test_journal_maps_frames_that_outlive_their_segment(void **state) {
+    (void)state;
+    struct journal *journal = fresh("m");
+    struct journal_map maps[3];
+    struct journal_frame info;
+    journal_budget(journal, 100000);
+    append_frames(journal, 0, 3, 1000);
+    for (uint64_t seq = 0; seq < 3; seq++)
+        assert_true(journal_frame_map(journal, seq, &maps[seq], why));
+    append_frames(journal, 3, 30, 1000);
+    assert_true(journal_n_gone(journal) >= 3);
+    for (uint64_t seq = 0; seq < 3; seq++) {
+        void *frame = make_frame(seq, 1000, &info);
+        assert_int_equal(maps[seq].bytes, info.bytes);
+        assert_memory_equal(maps[seq].frame, frame, info.bytes);
+        journal_frame_unmap(&maps[seq]);
+        free(frame);
+    }
+    assert_false(journal_frame_map(journal, 0, &maps[0], why));
+    journal_close(journal);
+}
+
+static void test_journal_says_that_its_folder_is_gone(void **state) {
+    char command[256];
+    struct journal_frame info;
+    (void)state;
+    struct journal *journal = fresh("v");
+    append_frames(journal, 0, 2, 2);
+    snprintf(command, sizeof command, "rm -rf %s/runs/v", folder);
+    assert_int_equal(system(command), 0);
+    void *frame = make_frame(2, 2, &info);
+    assert_int_equal(journal_append_frame(journal, frame, &info, why), JOURNAL_ERROR);
+    assert_int_equal(journal_append_event(journal, "{}", why), JOURNAL_ERROR);
+    assert_int_equal(journal_checkpoint(journal, "{}", "x", 1, why), JOURNAL_ERROR);
+    free(frame);
+    journal_close(journal);
+}
+
+// Names go bad, acknowledgements go forth and back, and a registration is there after a restart.
+static void test_recorders_are_kept_over_a_restart(void **state) {
+    struct recorder all[RECORDERS_MAX];
+    char name[16];
+    (void)state;
+    struct journal *journal = fresh("rec");
+    append_frames(journal, 0, 10, 2);
+    struct recorders *recorders = recorders_open(journal, why);
+    assert_int_equal(recorders_list(recorders, all), 0);
+    assert_int_equal(recorders_put(recorders, "a", -1, why), RECORDERS_OK);
+    assert_int_equal(recorders_put(recorders, "b", 4, why), RECORDERS_OK);
+    assert_int_equal(recorders_put(recorders, "a", 10, why), RECORDERS_AHEAD);
+    assert_int_equal(recorders_put(recorders, "a", 9, why), RECORDERS_OK);
+    assert_int_equal(recorders_put(recorders, "b", 2, why), RECORDERS_OK); // it lost its file
+    assert_true(recorders_slowest(recorders, all));
+    assert_string_equal(all[0].name, "b");
+    recorders_free(recorders);
+    recorders = recorders_open(journal, why);
+    assert_int_equal(recorders_list(recorders, all), 2);
+    assert_true(all[0].acked <= 9); // may be older than what was acknowledged, never newer
+    assert_int_equal(all[1].acked, 2);
+    assert_int_equal(recorders_remove(recorders, "c", why), RECORDERS_UNKNOWN);
+    assert_int_equal(recorders_remove(recorders, "b", why), RECORDERS_OK);
+    recorders_free(recorders);
+    recorders = recorders_open(journal, why);
+    assert_int_equal(recorders_list(recorders, all), 1);
+    for (int k = 1; k < RECORDERS_MAX; k++) {
+        snprintf(name, sizeof name, "n%d", k);
+        assert_int_equal(recorders_put(recorders, name, -1, why), RECORDERS_OK);
+    }
+    assert_int_equal(recorders_put(recorders, "more", -1, why), RECORDERS_TOO_MANY);
+    recorders_free(recorders);
+    assert_int_equal(journal_replace(journal, "recorders.json", "{", 1, why), JOURNAL_OK);
+    assert_null(recorders_open(journal, why));
     journal_close(journal);
 }
 
@@ -343,6 +509,11 @@ int main(int argc, char **argv) {
         cmocka_unit_test(test_journal_drops_oldest_segments_beyond_its_budget),
         cmocka_unit_test(test_journal_refuses_a_gap_in_seq),
         cmocka_unit_test(test_journal_cuts_half_an_event),
+        cmocka_unit_test(test_journal_refuses_a_changed_event),
+        cmocka_unit_test(test_journal_keeps_what_is_not_acknowledged),
+        cmocka_unit_test(test_journal_maps_frames_that_outlive_their_segment),
+        cmocka_unit_test(test_journal_says_that_its_folder_is_gone),
+        cmocka_unit_test(test_recorders_are_kept_over_a_restart),
         cmocka_unit_test(test_journal_keeps_the_previous_checkpoint),
         cmocka_unit_test(test_journal_lists_and_removes_runs),
         cmocka_unit_test(test_journal_lock_keeps_a_second_daemon_out),

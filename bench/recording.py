@@ -1,0 +1,156 @@
+"""What journal and recording cost a run, what stalled viewers cost it, and how fast fbar records. Timings are
+of pairs, one right after the other in turns, so that what else the machine does meets both; ratios count.
+
+    make bench-recording                  all of it, about two minutes
+    python3 bench/recording.py cost       one part: cost, viewers, throughput
+"""
+import os
+import pathlib
+import shutil
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+
+ROOT = pathlib.Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT / "tests" / "api"))
+
+import zmq  # noqa: E402
+from boxes import merged, water  # noqa: E402
+from fbard import Daemon, until  # noqa: E402
+
+FBAR = os.environ.get("FBAR") or str(ROOT / "build" / "fbar")
+DT, STEPS, EVERY, PAIRS = 1e-4, 100, 10, 8
+# 102,400 particles in 2D.
+SCENE = water(cell=0.05, time={"end": STEPS * DT, "dt": DT}, bodies={"pool": {"particles_per_cell": 256}},
+              output={"interval": 1e6, "probe_interval": 10 * DT})  # fmt: skip
+
+
+def seconds_per_step(run):
+    """Of wall-clock time in the step loop, with what it waited."""
+    performance = run["performance"]
+    return (performance["wall_s"] + performance["phases"]["waiting"]) / run["step"]
+
+
+def pairs(title, plain, other):
+    """Prints and gives the median ratio of `other` to `plain`."""
+    ratios, times = [], []
+    for k in range(PAIRS):
+        order = (plain, other) if k % 2 == 0 else (other, plain)
+        took = {f: f() for f in order}
+        ratios.append(took[other] / took[plain])
+        times.append(took[plain])
+    print(f"{title}: {1e3 * statistics.median(times):.2f} ms a step without; ratio "
+          f"{statistics.median(ratios):.4f} (median of {PAIRS} pairs: {', '.join(f'{r:.3f}' for r in sorted(ratios))})")  # fmt: skip
+    return statistics.median(ratios)
+
+
+def record(daemon, run, folder, *words):
+    return subprocess.Popen([FBAR, "--url", daemon.http, "record", run, "-o", str(folder / "a.h5"), *words],
+                            stdout=subprocess.DEVNULL)  # fmt: skip
+
+
+def remove(folder):
+    for path in folder.glob("a.*"):
+        path.unlink()
+
+
+def cost(daemon, folder):
+    output = []
+
+    def plain():
+        daemon.create(SCENE, id="plain")
+        run = daemon.wait("plain", "completed")
+        daemon.away("plain")
+        return seconds_per_step(run)
+
+    def recorded():
+        scene = merged(SCENE, {"output": {"interval": EVERY * DT}})
+        daemon.create(scene, id="recorded", start=False)
+        recorder = record(daemon, "recorded", folder)
+        until(lambda: daemon.run("recorded")["recorders"])
+        daemon.act("recorded", "resume")
+        run = daemon.wait("recorded", "completed")
+        assert recorder.wait() == 0
+        assert len(daemon.frames("recorded")) == STEPS // EVERY + 1
+        phases = run["performance"]["phases"]
+        output.append((phases["output"] + phases["waiting"]) / run["performance"]["wall_s"])
+        daemon.away("recorded")
+        remove(folder)
+        return seconds_per_step(run)
+
+    plain()
+    ratio = pairs(f"journal and recording, {STEPS} steps, a frame every {EVERY}", plain, recorded)
+    own = statistics.median(output)
+    print(f"  the run's own thread spends {100 * own:.2f} % on frames and on waiting for their room; with a frame "
+          f"every 100 steps a tenth: {10 * own:.3f} %, in all {10 * (ratio - 1):.2f} %")
+
+
+def viewers(daemon, folder):
+    scene = merged(SCENE, {"time": {"end": 60 * DT}, "output": {"interval": DT}})
+
+    def alone():
+        daemon.create(scene, id="alone")
+        run = daemon.wait("alone", "completed")
+        daemon.away("alone")
+        return seconds_per_step(run)
+
+    def watched():
+        context = zmq.Context()
+        stalled = [context.socket(zmq.SUB) for _ in range(16)]
+        for viewer in stalled:
+            viewer.set_hwm(1)
+            viewer.subscribe(b"run/")
+            viewer.connect(daemon.publish)
+        time.sleep(0.5)
+        daemon.create(scene, id="watched")
+        run = daemon.wait("watched", "completed")
+        for viewer in stalled:
+            viewer.close(0)
+        context.term()
+        daemon.away("watched")
+        return seconds_per_step(run)
+
+    pairs("16 viewers that stall, a frame every step", alone, watched)
+
+
+def throughput(daemon, folder):
+    scene = merged(SCENE, {"time": {"end": 120 * DT}, "output": {"interval": DT}})
+    daemon.create(scene, id="frames")
+    daemon.wait("frames", "completed")
+    frames = daemon.frames("frames")
+    megabytes = 1e-6 * sum(f["bytes"] for f in frames)
+    for words in ((), ("--compress", "1"), ("--compress", "6")):
+        rates = []
+        for _ in range(5 if not words else 1):
+            began = time.monotonic()
+            assert record(daemon, "frames", folder, *words).wait() == 0
+            rates.append(megabytes / (time.monotonic() - began))
+            size = 1e-6 * (folder / "a.h5").stat().st_size
+            remove(folder)
+        print(f"fbar record {' '.join(words) or 'uncompressed'}: {len(frames)} frames, {megabytes:.0f} MB: "
+              f"{statistics.median(rates):.0f} MB/s from start to FILE.h5 in place "
+              f"({min(rates):.0f} to {max(rates):.0f}), file {size:.0f} MB")  # fmt: skip
+    daemon.away("frames")
+
+
+def main():
+    parts = {f.__name__: f for f in (cost, viewers, throughput)}
+    wanted = sys.argv[1:] or list(parts)
+    if set(wanted) - set(parts):
+        sys.exit(f"usage: recording.py [{' | '.join(parts)}] ...")
+    memory = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None
+    folder = pathlib.Path(tempfile.mkdtemp(prefix="fbard-bench-", dir=memory))
+    print(f"one solver thread, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}, in {folder.parent}")
+    daemon = Daemon(folder, slots=1, threads=1).start()
+    try:
+        for part in wanted:
+            parts[part](daemon, folder)
+    finally:
+        daemon.stop()
+        shutil.rmtree(folder)
+
+
+if __name__ == "__main__":
+    main()

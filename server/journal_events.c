@@ -1,0 +1,97 @@
+// events.jsonl: one JSON object a line, which a person can read. The last member of each is
+// "check": XXH3-64 of the line before it, seeded with the check of the line before, so that a line
+// that was changed, lost or added is seen. A line without its end can only be the last one.
+#include <fcntl.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <unistd.h>
+
+#include "server/journal_inside.h"
+
+#define CHECK_BYTES 27 // "check":"0123456789abcdef"}
+
+static uint64_t check_of(const char *line, size_t bytes, uint64_t before) {
+    return XXH3_64bits_withSeed(line, bytes, before);
+}
+
+// Whether the line (without its end) carries the check that follows from `*check`, which it moves.
+static bool line_whole(const char *line, size_t bytes, uint64_t *check) {
+    char wanted[CHECK_BYTES + 1];
+    if (bytes <= CHECK_BYTES)
+        return false;
+    *check = check_of(line, bytes - CHECK_BYTES, *check);
+    snprintf(wanted, sizeof wanted, "\"check\":\"%016llx\"}", (unsigned long long)*check);
+    return memcmp(line + bytes - CHECK_BYTES, wanted, CHECK_BYTES) == 0;
+}
+
+bool journal_events_open(struct journal *j, char *why) {
+    char path[PATH_MAX];
+    journal_path(j, "events.jsonl", path, sizeof path);
+    j->events = open(path, O_RDWR | O_CREAT | O_CLOEXEC, 0600);
+    if (j->events < 0) {
+        journal_failure(errno, path, why);
+        return false;
+    }
+    size_t bytes = 0, whole = 0;
+    char *text = journal_file_text(path, &bytes);
+    if (text == NULL) {
+        journal_failure(errno, path, why);
+        return false;
+    }
+    bool sound = true;
+    for (const char *end; sound && (end = memchr(text + whole, '\n', bytes - whole)) != NULL;) {
+        size_t n = (size_t)(end - text) - whole;
+        sound = line_whole(text + whole, n, &j->event_check);
+        j->n_events++;
+        whole += n + 1;
+    }
+    free(text);
+    if (!sound) {
+        journal_explain(why, "%.400s: damaged line %llu", path, (unsigned long long)j->n_events);
+        return false;
+    }
+    if (whole < bytes && ftruncate(j->events, (off_t)whole) != 0) {
+        journal_failure(errno, path, why);
+        return false;
+    }
+    j->event_bytes = whole;
+    j->cut_bytes += bytes - whole;
+    return true;
+}
+
+enum journal_result journal_append_event(struct journal *j, const char *json, char *why) {
+    size_t n = strlen(json);
+    char *line = malloc(n + CHECK_BYTES + 3);
+    if (line == NULL)
+        return journal_failure(ENOMEM, j->folder, why);
+    // The object's closing brace gives way to the check and comes back behind it.
+    size_t stem = (size_t)sprintf(line, "%.*s%s", (int)n - 1, json, n > 2 ? "," : "");
+    uint64_t check = check_of(line, stem, j->event_check);
+    size_t whole =
+        stem + (size_t)sprintf(line + stem, "\"check\":\"%016llx\"}\n", (unsigned long long)check);
+    int error = journal_vanished(j->events)
+                    ? ENOENT
+                    : journal_write_at(j->events, line, whole, j->event_bytes);
+    if (error == 0 && j->power && fdatasync(j->events) != 0)
+        error = errno;
+    free(line);
+    if (error != 0) {
+        // What was written of it is cut; where that fails too, the next line is written over it.
+        int ignored = ftruncate(j->events, (off_t)j->event_bytes);
+        (void)ignored;
+        return journal_failure(error, j->folder, why);
+    }
+    j->event_bytes += whole;
+    j->event_check = check;
+    pthread_mutex_lock(&j->lock);
+    j->n_events++;
+    pthread_mutex_unlock(&j->lock);
+    return JOURNAL_OK;
+}
+
+uint64_t journal_n_events(struct journal *j) {
+    pthread_mutex_lock(&j->lock);
+    uint64_t n = j->n_events;
+    pthread_mutex_unlock(&j->lock);
+    return n;
+}
