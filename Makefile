@@ -138,6 +138,10 @@ $(B)/tests/%: $(B)/obj/tests/%.o $(SERVER_OBJ) $(call obj,$(PROTO_SRC)) $(B)/lib
 	@mkdir -p $(@D)
 	$(Q)$(CC) $(ALL_LDFLAGS) -pthread $(OPENMP) $^ $(call pc_libs,$(SERVER_LIBS) cmocka) -lm -o $@
 
+$(B)/bench: $(B)/obj/tests/bench/bench.o $(B)/libmpm.a
+	$(call say,LD,$@)
+	$(Q)$(CC) $(ALL_LDFLAGS) $(OPENMP) $^ -lm -o $@
+
 ## ---- Checks ----
 
 deps: ## install what is missing (Debian packages; as root or with sudo)

@@ -27,12 +27,12 @@
     X(DISPLACEMENT, "displacement")                                                                \
     X(FIELD, "field")                                                                              \
     X(REACTION, "reaction")                                                                        \
-    X(MAXIMUM, "maximum") X(MINIMUM, "minimum") X(MEAN, "mean") X(ENERGY, "energy")                \
-        X(MOMENTUM, "momentum") X(DRIFT, "drift")
+    X(MAXIMUM, "maximum")                                                                          \
+    X(MINIMUM, "minimum") X(MEAN, "mean") X(ENERGY, "energy") X(MOMENTUM, "momentum")              \
+        X(DRIFT, "drift")
 
 // Instruction sets of the kernels: plain scalar code, and lanes of 4 or 8 (x86-64-v3 and v4).
-#define MPM_ISA_LIST(X)                                                                            \
-    X(AUTO, "auto") X(BASELINE, "baseline") X(AVX2, "avx2") X(AVX512, "avx512")
+#define MPM_ISA_LIST(X) X(AUTO, "auto") X(BASELINE, "baseline") X(AVX2, "avx2") X(AVX512, "avx512")
 
 enum mpm_basis {
 #define X(code, text) MPM_##code,
@@ -277,7 +277,7 @@ struct mpm_def {
         wants_volume_ratio; // a frame will ask for the raw volume ratio, also of fluids under F-bar
     size_t memory_limit;    // bytes, 0 = none
     int n_threads;          // >= 1; results do not depend on it
-    enum mpm_isa isa; // of the kernels; another one changes results by round-off only
+    enum mpm_isa isa;       // of the kernels; another one changes results by round-off only
     // Wall-clock seconds, to time the phases; NULL = no timing. Called from the stepping thread
     // only.
     double (*clock)(void);

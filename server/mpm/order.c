@@ -70,7 +70,7 @@ static void find_keys(const struct mpm_particles *s, const struct mpm_grid *g, e
         int base[MPM_MAX_DIM];
         for (int d = 0; d < g->dim; d++) {
             base[d] = (int)mpm_base(basis, (s->x[mpm_at(p, g->dim, d)] - g->origin[d]) * g->inv_h,
-                               s->half);
+                                    s->half);
         }
         key[p] = g->dim == 2 ? mpm_cell_key(g, base, 2) : mpm_cell_key(g, base, 3);
     }
@@ -279,8 +279,7 @@ bool mpm_activate_around(struct mpm_grid *grid, enum mpm_basis basis, const doub
     for (int d = 0; d < grid->dim; d++) {
         base[d] = (int)mpm_base(basis, (x[d] - grid->origin[d]) * grid->inv_h, half);
     }
-    const uint32_t key =
-        grid->dim == 2 ? mpm_cell_key(grid, base, 2) : mpm_cell_key(grid, base, 3);
+    const uint32_t key = grid->dim == 2 ? mpm_cell_key(grid, base, 2) : mpm_cell_key(grid, base, 3);
     const int cell = (int)(key & (uint32_t)(MPM_BLOCK_NODES(grid->dim) - 1));
     return activate(grid, key >> MPM_BLOCK_BITS(grid->dim),
                     blocks_near(cell, mpm_support(basis), grid->dim));

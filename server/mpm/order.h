@@ -21,8 +21,8 @@ struct mpm_tile {
 
 struct mpm_order {
     size_t n_tiles, capacity;
-    struct mpm_tile *tile;                  // by block
-    uint32_t *by_colour;                    // tiles by colour
+    struct mpm_tile *tile;                    // by block
+    uint32_t *by_colour;                      // tiles by colour
     size_t colour_begin[MPM_MAX_COLOURS + 1]; // of by_colour; n_colours + 1 in use
     int n_colours;
 };

@@ -24,9 +24,9 @@ struct mpm_particles {
     int law; // enum mpm_law of the material
     double parameters[MPM_MAX_PARAMETERS];
     double constants[MPM_MAX_CONSTANTS]; // what the law has prepared of them
-    double density;          // kg/m^3, reference; a particle's mass is density * V0
-    double half, inv_4_half; // uGIMP: half the particle size, in cells; 1 / (4 half)
-    bool wants_fbar;         // false: the material is excepted from F-bar
+    double density;                      // kg/m^3, reference; a particle's mass is density * V0
+    double half, inv_4_half;             // uGIMP: half the particle size, in cells; 1 / (4 half)
+    bool wants_fbar;                     // false: the material is excepted from F-bar
 
     uint32_t *id; // (n) less first_id; unaligned with the blocks: plain order
     uint32_t *at; // (n) the place of each id, where something asks for it, else NULL

@@ -398,7 +398,8 @@ MPM_KERNEL uint64_t mpm_changes_64(const int32_t *number) {
 // out[i] = from[which[i]] + plus[i], eight at a time, of eight to choose from.
 MPM_KERNEL void mpm_pick_8(const uint32_t *from, const uint8_t *which, const uint8_t *plus,
                            uint32_t *out) {
-    const __m256i index = _mm256_cvtepu8_epi32(_mm_loadl_epi64((const __m128i *)(const void *)which));
+    const __m256i index =
+        _mm256_cvtepu8_epi32(_mm_loadl_epi64((const __m128i *)(const void *)which));
     const __m256i add = _mm256_cvtepu8_epi32(_mm_loadl_epi64((const __m128i *)(const void *)plus));
     const __m256i all = _mm256_loadu_si256((const __m256i *)(const void *)from);
     _mm256_storeu_si256((__m256i *)(void *)out,
@@ -441,9 +442,11 @@ MPM_KERNEL void mpm_transpose(const mpm_vec *in, double *out, const int stride) 
     }
     for (int i = 0; i < 2; i++) {
         _mm512_store_pd(out + i * stride, _mm512_shuffle_f64x2(quad[i], quad[i + 4], 0x88));
-        _mm512_store_pd(out + (2 + i) * stride, _mm512_shuffle_f64x2(quad[i + 2], quad[i + 6], 0x88));
+        _mm512_store_pd(out + (2 + i) * stride,
+                        _mm512_shuffle_f64x2(quad[i + 2], quad[i + 6], 0x88));
         _mm512_store_pd(out + (4 + i) * stride, _mm512_shuffle_f64x2(quad[i], quad[i + 4], 0xdd));
-        _mm512_store_pd(out + (6 + i) * stride, _mm512_shuffle_f64x2(quad[i + 2], quad[i + 6], 0xdd));
+        _mm512_store_pd(out + (6 + i) * stride,
+                        _mm512_shuffle_f64x2(quad[i + 2], quad[i + 6], 0xdd));
     }
 }
 #endif

@@ -6,7 +6,7 @@
 
 #include "server/mpm/sim.h"
 
-#define TILES_A_TURN 2 // tiles that a thread takes at a time
+#define TILES_A_TURN 2  // tiles that a thread takes at a time
 #define SLOTS_A_PART 64 // blocks of nodes that a thread takes at a time
 #define UNSTABLE_CFL                                                                               \
     1.0 // no basis is stable at dt >= 0.9 h/c (docs/method.md): beyond this it is not tried
@@ -59,9 +59,10 @@ typedef void span_work(const struct mpm_sim *sim, const struct mpm_span *span,
                        struct mpm_span_result *result);
 
 static void work_on(const struct mpm_sim *sim, struct mpm_span span, size_t begin, size_t end,
-                    span_work *work, struct mpm_span_result *result) {
+                    size_t next, span_work *work, struct mpm_span_result *result) {
     span.begin = begin;
     span.end = end;
+    span.next = next;
     *result = mpm_nothing_found();
     work(sim, &span, result);
 }
@@ -79,7 +80,9 @@ static void for_tiles(const struct mpm_sim *sim, size_t body, struct mpm_span sp
 #pragma omp for schedule(dynamic, TILES_A_TURN)
         for (size_t k = order->colour_begin[colour]; k < order->colour_begin[colour + 1]; k++) {
             const size_t t = order->by_colour[k];
-            work_on(sim, span, order->tile[t].begin, order->tile[t].end, work, &sim->results[t]);
+            const size_t next = k + 1 < order->n_tiles ? order->by_colour[k + 1] : t;
+            work_on(sim, span, order->tile[t].begin, order->tile[t].end, order->tile[next].begin,
+                    work, &sim->results[t]);
         }
     }
 }
@@ -91,8 +94,8 @@ static size_t for_chunks(const struct mpm_sim *sim, struct mpm_span span, span_w
     (void)n_threads; // without OpenMP
 #pragma omp parallel for schedule(dynamic, 1) num_threads(n_threads) if (n_threads > 1)
     for (size_t k = 0; k < n_chunks; k++) {
-        const size_t end = (k + 1) * MPM_CHUNK;
-        work_on(sim, span, k * MPM_CHUNK, end < n ? end : n, work, &sim->results[k]);
+        const size_t begin = k * MPM_CHUNK, end = begin + MPM_CHUNK;
+        work_on(sim, span, begin, end < n ? end : n, end < n ? end : begin, work, &sim->results[k]);
     }
     return n_chunks;
 }
@@ -293,7 +296,7 @@ static void particles_to_grid(struct mpm_sim *sim, double dt, bool any_fbar, dou
         if (load->active) {
             mpm_load_update(load, s, sim->c.time - mpm_start_time(sim));
             sim->plain->force(&(struct mpm_span){.s = s, .grid = &sim->grid}, load->place,
-                                load->force, load->n);
+                              load->force, load->n);
         }
     }
     for (size_t k = 0; k < sim->n_rigids; k++) {

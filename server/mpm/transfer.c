@@ -1,8 +1,8 @@
 // Particle-grid transfers: the plain scalar kernels, written once for every dimension and basis.
 //
 // They follow docs/method.md equation by equation: the baseline that server/mpm/transfer_lanes.c is
-// checked against, and what runs where its instruction sets are missing. Zhao, Jiang, Choo, eqs. 7-17; F-bar: their Algorithm 1, and docs/method.md
-// section 4 for the anchored scheme.
+// checked against, and what runs where its instruction sets are missing. Zhao, Jiang, Choo, eqs.
+// 7-17; F-bar: their Algorithm 1, and docs/method.md section 4 for the anchored scheme.
 #include "server/mpm/transfer.h"
 
 #include <stdint.h>
@@ -26,7 +26,8 @@ MPM_KERNEL void stencil_at(struct stencil *t, const struct mpm_span *span, size_
     int base[MPM_MAX_DIM];
     for (int d = 0; d < dim; d++) {
         const double xi = (span->s->x[mpm_at(p, dim, d)] - g->origin[d]) * g->inv_h;
-        base[d] = (int)mpm_weights(basis, xi, span->s->half, span->s->inv_4_half, t->w[d], t->dw[d]);
+        base[d] =
+            (int)mpm_weights(basis, xi, span->s->half, span->s->inv_4_half, t->w[d], t->dw[d]);
     }
     const uint32_t key = mpm_cell_key(g, base, dim);
     if (key != t->key) {

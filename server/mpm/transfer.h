@@ -8,6 +8,7 @@ struct mpm_span {
     struct mpm_particles *s;
     struct mpm_grid *grid;
     size_t begin, end;
+    size_t next; // where the next span of the same thread begins, to fetch it early; may be `begin`
     double dt, blend;
     bool fbar;                   // this body takes part in F-bar in this step
     enum mpm_fbar_scheme scheme; // if so, by which scheme
@@ -42,8 +43,9 @@ struct mpm_motion {
 struct mpm_kernels {
     // eqs. 7, 8, 10: mass, momentum, internal force and, with F-bar, volume to the grid.
     void (*p2g)(const struct mpm_span *span, struct mpm_span_result *result);
-    // eq. 9: nodal velocities of the blocks with slots [begin, end). Damping acts on the total force,
-    // before boundary conditions; FLIP's increment is taken from v^n before boundary conditions.
+    // eq. 9: nodal velocities of the blocks with slots [begin, end). Damping acts on the total
+    // force, before boundary conditions; FLIP's increment is taken from v^n before boundary
+    // conditions.
     void (*move_nodes)(const struct mpm_grid *grid, uint32_t begin, uint32_t end,
                        const struct mpm_motion *motion);
     // eqs. 11-17: velocity, and the deformation with the plain increment; then, where F-bar is off,

@@ -23,10 +23,16 @@
 #error "the plain kernels are server/mpm/transfer.c"
 #endif
 
-#define BATCH 64                 // particles
-#define ROOM (BATCH + MPM_LANES) // the last vector of a run may reach past the batch
+#define BATCH 64                // particles
+#define MOST (BATCH + MPM_BLOCK) // of the last batch of a span, which takes what would be left over
+#define ROOM (MOST + 8)          // whole vectors, rows of cache lines
 #define PARTS (8 / MPM_LANES)    // vectors of one node's eight components
 #define UNROLL _Pragma("GCC unroll 8")
+#if DIM == 2
+#define UNROLL_2D UNROLL
+#else // the planes of a stencil: more code than the instruction cache wants
+#define UNROLL_2D _Pragma("GCC unroll 1")
+#endif
 
 // What a particle gives to its nodes, in the node's order of components (m, mv, f, V):
 //   2D: m mv_x mv_y V | -V/h (s_xx s_xy) -V/h (s_xy s_yy)
@@ -37,18 +43,20 @@
 struct extent {
     size_t first;   // particle of lane 0, a multiple of MPM_BLOCK
     int begin, end; // lanes that belong to the span
+    size_t next;    // like first, of the batch that comes next
 };
 
 struct batch {
     struct extent in;
-    int n_runs, run[BATCH + 1]; // first lane of each run, and the end of the last
-    uint32_t key[BATCH];        // by run
+    int n_runs, run[MOST + 1]; // first lane of each run, and the end of the last
+    uint32_t key[MOST];         // by run
+    uint32_t nodes[MOST][MPM_MAX_STENCIL]; // by run: of its stencil
     MPM_ALIGNED double t[MPM_MAX_DIM][ROOM]; // place in the cell, that the weights follow from
     MPM_ALIGNED double w[MPM_MAX_DIM][MPM_MAX_SUPPORT][ROOM], dw[MPM_MAX_DIM][MPM_MAX_SUPPORT][ROOM];
     MPM_ALIGNED double v[MPM_MAX_DIM][ROOM], dv[MPM_MAX_DIM][ROOM], l[9][ROOM]; // gathered
     MPM_ALIGNED double ratio[2][ROOM]; // F-bar's averages, or what goes into them
     MPM_ALIGNED double row[ROOM][4];   // weights along the last direction, particle by particle
-    MPM_ALIGNED double record[BATCH][16];
+    MPM_ALIGNED double record[ROOM][16];
 };
 
 // Stages take what they read of a batch's extent, of the particles' and of the grid's description as
@@ -74,6 +82,18 @@ MPM_KERNEL void put(struct extent in, int lane, double *to, mpm_vec a, const boo
         mpm_store_lanes(to, a, in.begin - lane, in.end - lane);
     }
 }
+// The same from a field of the particles, and the next batch's on the way to the cache: tiles of
+// one colour lie apart, where the processor does not look ahead.
+MPM_KERNEL void ahead(double *field, struct extent in, int lane, int n_components, int c) {
+    if (MPM_LANES == 8 || lane % MPM_BLOCK == 0) { // a cache line
+        __builtin_prefetch(field + mpm_at(in.next + (size_t)lane, n_components, c));
+    }
+}
+MPM_KERNEL mpm_vec fetch(struct extent in, int lane, double *field, int n_components, int c,
+                         double other, const bool whole) {
+    ahead(field, in, lane, n_components, c);
+    return get(in, lane, at(field, in, lane, n_components, c), other, whole);
+}
 // One loop over a batch's vectors, of which the body knows whether they are whole.
 #define FOR_VECTORS(in, body)                                                                      \
     for (int lane = 0; lane < (in).end; lane += MPM_LANES) {                                       \
@@ -91,10 +111,14 @@ MPM_KERNEL void find_runs(struct batch *b, const int32_t *key) {
     const struct extent in = b->in;
     uint64_t begins = mpm_changes_64(key);
     begins = (begins | (uint64_t)1 << in.begin) & UINT64_MAX << in.begin;
-    begins &= UINT64_MAX >> (BATCH - in.end);
+    begins &= in.end < 64 ? ~(UINT64_MAX << in.end) : UINT64_MAX;
     int n = 0;
     for (; begins; begins &= begins - 1) {
         b->run[n++] = __builtin_ctzll(begins);
+    }
+    for (int lane = 64; lane < in.end; lane++) {
+        b->run[n] = lane;
+        n += key[lane] != key[lane - 1];
     }
     for (int r = 0; r < n; r++) {
         b->key[r] = (uint32_t)key[b->run[r]];
@@ -116,6 +140,7 @@ MPM_KERNEL void find_cells(struct batch *b, const struct mpm_span *span, const i
         UNROLL for (int d = 0; d < dim; d++) {
             // Lanes of other tiles are read, too: no pass that has them writes positions.
             const mpm_vec x = mpm_load_aligned(at(s->x, in, lane, dim, d));
+            ahead(s->x, in, lane, dim, d);
             const mpm_vec xi = (x - g->origin[d]) * g->inv_h;
             const mpm_vec base = mpm_base(basis, xi, s->half);
             const mpm_vec of = mpm_floor(base * (1.0 / MPM_EDGE));
@@ -159,15 +184,21 @@ MPM_KERNEL void find_rows(struct batch *b, const int dim, const enum mpm_basis b
     }
 }
 
-// mpm_grid_stencil from the grid's table, many nodes at a time.
-MPM_KERNEL void find_nodes(uint32_t *nodes, const struct mpm_grid *g, uint32_t key, const int dim,
-                           const int support) {
+// mpm_grid_stencil for all runs, from the grid's table and many nodes at a time: before anything
+// else, since each is a long chain of loads.
+MPM_KERNEL void find_nodes(struct batch *b, const struct mpm_grid *grid, const int dim,
+                           const enum mpm_basis basis) {
+    const int support = mpm_support(basis);
     const int n = dim == 2 ? support * support : support * support * support;
-    const size_t cell = key & (uint32_t)(MPM_BLOCK_NODES(dim) - 1);
-    const uint32_t *near = g->near[g->slot[key >> MPM_BLOCK_BITS(dim)]];
-    const uint8_t *which = g->which + cell * MPM_MAX_STENCIL, *place = g->place + cell * MPM_MAX_STENCIL;
-    UNROLL for (int k = 0; k < n; k += 8) {
-        mpm_pick_8(near, which + k, place + k, nodes + k);
+    const struct mpm_grid copy = *grid, *g = &copy;
+    const int n_runs = b->n_runs;
+    for (int r = 0; r < n_runs; r++) {
+        const uint32_t key = b->key[r];
+        const size_t row = (key & (uint32_t)(MPM_BLOCK_NODES(dim) - 1)) * MPM_MAX_STENCIL;
+        const uint32_t *near = g->near[g->slot[key >> MPM_BLOCK_BITS(dim)]];
+        UNROLL for (int k = 0; k < n; k += 8) {
+            mpm_pick_8(near, g->which + row + k, g->place + row + k, b->nodes[r] + k);
+        }
     }
 }
 
@@ -194,7 +225,10 @@ MPM_KERNEL void gather_velocity_at(const struct batch *b, int lane,
         mpm_weights_at(basis, mpm_load_aligned(&b->t[d][lane]), s->half, s->inv_4_half, w[d], dw[d]);
     }
     const mpm_vec *w_last = w[last], *dw_last = dw[last];
-    UNROLL for (int a = 0; a < support; a++) {
+    UNROLL for (int k = 0; k < 2 * dim + dim * dim; k++) {
+        out[k] = mpm_splat(0);
+    }
+    UNROLL_2D for (int a = 0; a < support; a++) {
         const mpm_vec wa = w[0][a], dwa = dw[0][a];
         UNROLL for (int p = 0; p < planes; p++) {
             const int row = (dim == 3 ? a * support + p : a) * support;
@@ -217,14 +251,12 @@ MPM_KERNEL void gather_velocity_at(const struct batch *b, int lane,
                 dw_row[0] = dwa * w[1][p];
                 dw_row[1] = wa * dw[1][p];
             }
-            const bool first = a == 0 && p == 0;
             UNROLL for (int d = 0; d < dim; d++) {
-                v[d] = first ? w_row * v_w[d] : v[d] + w_row * v_w[d];
-                dv[d] = first ? w_row * dv_w[d] : dv[d] + w_row * dv_w[d];
-                mpm_vec *to = &l[d * dim];
-                to[last] = first ? w_row * v_dw[d] : to[last] + w_row * v_dw[d];
+                v[d] += w_row * v_w[d];
+                dv[d] += w_row * dv_w[d];
+                l[d * dim + last] += w_row * v_dw[d];
                 UNROLL for (int e = 0; e < last; e++) {
-                    to[e] = first ? dw_row[e] * v_w[d] : to[e] + dw_row[e] * v_w[d];
+                    l[d * dim + e] += dw_row[e] * v_w[d];
                 }
             }
         }
@@ -243,7 +275,10 @@ MPM_KERNEL void gather_ratios_at(const struct batch *b, int lane, const struct m
         mpm_weights_at(basis, mpm_load_aligned(&b->t[d][lane]), s->half, s->inv_4_half, w[d], dw);
     }
     const mpm_vec *w_last = w[last];
-    UNROLL for (int a = 0; a < support; a++) {
+    UNROLL for (int k = 0; k < scalars; k++) {
+        sum[k] = mpm_splat(0);
+    }
+    UNROLL_2D for (int a = 0; a < support; a++) {
         const mpm_vec wa = w[0][a];
         UNROLL for (int p = 0; p < planes; p++) {
             const int row = (dim == 3 ? a * support + p : a) * support;
@@ -257,7 +292,7 @@ MPM_KERNEL void gather_ratios_at(const struct batch *b, int lane, const struct m
                     const mpm_vec of = node_value(one, other, second, two);
                     along = c == 0 ? w_last[c] * of : along + w_last[c] * of;
                 }
-                sum[k] = a == 0 && p == 0 ? w_row * along : sum[k] + w_row * along;
+                sum[k] += w_row * along;
             }
         }
     }
@@ -281,36 +316,29 @@ MPM_KERNEL void gather(struct batch *b, const struct mpm_span *span, const int d
     const struct extent in = b->in;
     const struct mpm_particles part = *span->s, *s = &part;
     const struct mpm_grid grid = *span->grid, *g = &grid;
-    const int support = mpm_support(basis), n = scalars == 0 ? 2 * dim + dim * dim : scalars;
-    uint32_t stencil[2][MPM_STENCIL_ROOM], *nodes = stencil[0], *others = stencil[1];
-    int run = 0;
-    find_nodes(nodes, g, b->key[0], dim, support);
+    const int n = scalars == 0 ? 2 * dim + dim * dim : scalars;
+    int run = 0; // the one that the vector begins in
     for (int lane = in.begin / MPM_LANES * MPM_LANES; lane < in.end; lane += MPM_LANES) {
-        // `nodes` are those of the run that the vector begins in.
         mpm_vec out[6 + 9];
-        if (b->run[run + 1] >= lane + MPM_LANES || run + 1 == b->n_runs) {
-            gather_at(b, lane, s, g, nodes, nodes, mpm_from_lane(MPM_LANES), false, out, dim, basis, scalars);
-        } else {
-            find_nodes(others, g, b->key[run + 1], dim, support);
-            mpm_mask second = mpm_from_lane(b->run[run + 1] - lane);
-            gather_at(b, lane, s, g, nodes, others, second, true, out, dim, basis, scalars);
-            uint32_t *swap = nodes;
-            nodes = others;
-            others = swap;
-            for (run++; run + 1 < b->n_runs && b->run[run + 1] < lane + MPM_LANES; run++) {
-                mpm_vec more[6 + 9];
-                find_nodes(nodes, g, b->key[run + 1], dim, support);
-                second = mpm_from_lane(b->run[run + 1] - lane);
-                gather_at(b, lane, s, g, nodes, nodes, second, false, more, dim, basis, scalars);
-                for (int k = 0; k < n; k++) {
-                    out[k] = mpm_select(second, more[k], out[k]);
-                }
+        for (int from = 0; from < MPM_LANES;) { // once, but for vectors of more than two cells
+            mpm_vec piece[6 + 9];
+            const int next = run + 1 < b->n_runs ? b->run[run + 1] - lane : MPM_LANES;
+            if (next >= MPM_LANES) {
+                gather_at(b, lane, s, g, b->nodes[run], b->nodes[run], mpm_from_lane(MPM_LANES),
+                          false, piece, dim, basis, scalars);
+            } else {
+                gather_at(b, lane, s, g, b->nodes[run], b->nodes[run + 1], mpm_from_lane(next), true,
+                          piece, dim, basis, scalars);
+                run++;
             }
+            const mpm_mask of = mpm_from_lane(from);
+            UNROLL for (int k = 0; k < n; k++) {
+                out[k] = from > 0 ? mpm_select(of, piece[k], out[k]) : piece[k];
+            }
+            from = run + 1 < b->n_runs ? b->run[run + 1] - lane : MPM_LANES;
+            run += from < MPM_LANES;
         }
-        if (run + 1 < b->n_runs && b->run[run + 1] == lane + MPM_LANES) {
-            run++;
-            find_nodes(nodes, g, b->key[run], dim, support);
-        }
+        run += run + 1 < b->n_runs && b->run[run + 1] == lane + MPM_LANES;
         if (scalars > 0) {
             UNROLL for (int k = 0; k < scalars; k++) {
                 mpm_store_aligned(&b->ratio[k][lane], out[k]);
@@ -412,13 +440,11 @@ MPM_KERNEL void scatter_part_2d(const struct batch *b, double *node, const uint3
 MPM_KERNEL void scatter_records(const struct batch *b, const struct mpm_grid *g, const int dim,
                                 const enum mpm_basis basis) {
     for (int r = 0; r < b->n_runs; r++) {
-        uint32_t nodes[MPM_STENCIL_ROOM];
-        find_nodes(nodes, g, b->key[r], dim, mpm_support(basis));
         UNROLL for (int part = 0; part < PARTS; part++) {
             if (dim == 2) {
-                scatter_part_2d(b, g->node, nodes, b->run[r], b->run[r + 1], part, basis);
+                scatter_part_2d(b, g->node, b->nodes[r], b->run[r], b->run[r + 1], part, basis);
             } else {
-                scatter_part(b, g->node, nodes, b->run[r], b->run[r + 1], part, basis);
+                scatter_part(b, g->node, b->nodes[r], b->run[r], b->run[r + 1], part, basis);
             }
         }
     }
@@ -429,8 +455,7 @@ MPM_KERNEL void scatter_ratios(struct batch *b, const struct mpm_grid *g, const 
                                const enum mpm_basis basis, const int scalars) {
     const int support = mpm_support(basis), planes = dim == 3 ? support : 1;
     for (int r = 0; r < b->n_runs; r++) {
-        uint32_t nodes[MPM_STENCIL_ROOM];
-        find_nodes(nodes, g, b->key[r], dim, support);
+        const uint32_t *nodes = b->nodes[r];
         const int begin = b->run[r], end = b->run[r + 1];
         for (int k = 0; k < scalars; k++) {
             mpm_four sum[MPM_MAX_SUPPORT][MPM_MAX_SUPPORT];
@@ -577,7 +602,7 @@ MPM_KERNEL void load_kept(const struct mpm_particles *s, struct extent in, int l
     const int n = n_kept(kinematics, dim);
     UNROLL for (int k = 0; k < n; k++) { // the undeformed state where lanes are not the batch's
         const bool one = kinematics == MPM_KEEPS_F ? k % (dim + 1) == 0 : k < 3;
-        kept[k] = get(in, lane, at(field_kept(s, kinematics), in, lane, n, k), one, whole);
+        kept[k] = fetch(in, lane, field_kept(s, kinematics), n, k, one, whole);
     }
 }
 MPM_KERNEL void store_kept(const struct mpm_particles *s, struct extent in, int lane,
@@ -658,7 +683,7 @@ MPM_KERNEL void update_velocity(struct batch *b, struct extent in, int lane,
         const mpm_vec v_pic = get(in, lane, &b->v[d][lane], 0, whole);
         const mpm_vec dv = get(in, lane, &b->dv[d][lane], 0, whole);
         double *to = at(s->v, in, lane, dim, d);
-        const mpm_vec flip = get(in, lane, to, 0, whole) + dv;
+        const mpm_vec flip = fetch(in, lane, s->v, dim, d, 0, whole) + dv;
         const mpm_vec v = v_pic + by->blend * (flip - v_pic);
         put(in, lane, to, v, whole);
         v2 += v * v;
@@ -666,6 +691,7 @@ MPM_KERNEL void update_velocity(struct batch *b, struct extent in, int lane,
         mpm_store_aligned(&b->v[d][lane], dx); // from here on the step
         if (keeps_step) {
             put(in, lane, at(s->dx, in, lane, dim, d), dx, whole);
+            ahead(s->dx, in, lane, dim, d);
         }
     }
     fault_unless(v2 < INFINITY, r, in, lane, MPM_ERR_NOT_FINITE, v2);
@@ -691,7 +717,7 @@ MPM_KERNEL void update_deformation(struct batch *b, struct extent in, int lane,
     store_kept(s, in, lane, kept, dim, kinematics, whole);
     const mpm_vec ratio = ratio_of(kept, dim, kinematics);
     double *to_V = at(s->V, in, lane, 1, 0);
-    mpm_vec V = get(in, lane, to_V, 1, whole);
+    mpm_vec V = fetch(in, lane, s->V, 1, 0, 1, whole);
     if (kinematics == MPM_KEEPS_J) {
         if (s->J_raw) {
             double *to = at(s->J_raw, in, lane, 1, 0);
@@ -716,6 +742,7 @@ MPM_KERNEL void update_deformation(struct batch *b, struct extent in, int lane,
     }
     const mpm_vec dJ = 1.0 + dJ_minus_one;
     put(in, lane, at(s->dJ, in, lane, 1, 0), dJ, whole);
+    ahead(s->dJ, in, lane, 1, 0);
     if (kinematics == MPM_KEEPS_B) { // sqrt(det b) would not tell
         fault_unless(dJ > 0.0, r, in, lane, MPM_ERR_VOLUME, dJ);
     }
@@ -723,7 +750,7 @@ MPM_KERNEL void update_deformation(struct batch *b, struct extent in, int lane,
     if (scheme == MPM_FBAR_ZHAO) {
         mpm_store_aligned(&b->ratio[0][lane], V * ratio);
     } else {
-        const mpm_vec A = V * dJ, H = V / get(in, lane, at(s->V0, in, lane, 1, 0), 1, whole);
+        const mpm_vec A = V * dJ, H = V / fetch(in, lane, s->V0, 1, 0, 1, whole);
         mpm_store_aligned(&b->ratio[0][lane], A);
         mpm_store_aligned(&b->ratio[1][lane], (1 - by->a) * V * ratio + by->a * A * H);
     }
@@ -739,14 +766,14 @@ MPM_KERNEL void rescale(struct batch *b, struct extent in, int lane,
     mpm_vec kept[9], dx2 = mpm_splat(0);
     load_kept(s, in, lane, kept, dim, kinematics, whole);
     UNROLL for (int d = 0; d < dim; d++) {
-        const mpm_vec dx = get(in, lane, at(s->dx, in, lane, dim, d), 0, whole);
+        const mpm_vec dx = fetch(in, lane, s->dx, dim, d, 0, whole);
         mpm_store_aligned(&b->v[d][lane], dx);
         dx2 += dx * dx;
     }
     const mpm_vec trial = ratio_of(kept, dim, kinematics);
     const mpm_vec A = get(in, lane, &b->ratio[0][lane], 1, whole);
     double *to_V = at(s->V, in, lane, 1, 0);
-    mpm_vec ratio = A, V = get(in, lane, to_V, 1, whole);
+    mpm_vec ratio = A, V = fetch(in, lane, s->V, 1, 0, 1, whole);
     if (scheme == MPM_FBAR_ANCHORED) {
         ratio = get(in, lane, &b->ratio[1][lane], 1, whole);
     }
@@ -756,10 +783,10 @@ MPM_KERNEL void rescale(struct batch *b, struct extent in, int lane,
     if (scheme == MPM_FBAR_ANCHORED) {
         const mpm_vec reach = (by->C * by->inv_h) * mpm_sqrt(dx2);
         const mpm_vec beta = mpm_min(reach, mpm_splat(1));
-        const mpm_vec V0 = get(in, lane, at(s->V0, in, lane, 1, 0), 1, whole);
+        const mpm_vec V0 = fetch(in, lane, s->V0, 1, 0, 1, whole);
         V = (1.0 - beta) * V * A + beta * V0 * ratio;
     } else { // eq. 15: forces use the unaveraged volume; but a fluid's follows Jbar
-        const mpm_vec dJ = get(in, lane, at(s->dJ, in, lane, 1, 0), 1, whole);
+        const mpm_vec dJ = fetch(in, lane, s->dJ, 1, 0, 1, whole);
         V = kinematics == MPM_KEEPS_J ? V * (dJ * q) : V * dJ;
     }
     put(in, lane, to_V, V, whole);
@@ -802,6 +829,7 @@ MPM_KERNEL void update_stress(struct extent in, int lane, const struct mpm_parti
     }
     UNROLL for (int k = 0; k < n_sym; k++) {
         put(in, lane, at(s->sigma, in, lane, n_sym, k), sigma[k], whole);
+        ahead(s->sigma, in, lane, n_sym, k);
     }
 }
 
@@ -809,7 +837,7 @@ MPM_KERNEL void update_stress(struct extent in, int lane, const struct mpm_parti
 MPM_KERNEL void update_position(struct batch *b, struct extent in, int lane, const struct mpm_particles *s,
                                 struct mpm_span_result *r, struct found *found, const int dim,
                                 const bool whole) {
-    const mpm_vec m = s->density * get(in, lane, at(s->V0, in, lane, 1, 0), 0, whole);
+    const mpm_vec m = s->density * fetch(in, lane, s->V0, 1, 0, 0, whole);
     const size_t one = in.first + (size_t)in.begin; // stands for lanes that are not the batch's
     UNROLL for (int d = 0; d < dim; d++) {
         double *to = at(s->x, in, lane, dim, d);
@@ -836,6 +864,24 @@ MPM_KERNEL void finish(struct batch *b, const struct mpm_particles *s, struct mp
     *found = f;
 }
 
+// One for each law, shared by all that update particles.
+typedef void finish_lanes(struct batch *b, const struct mpm_particles *s, struct mpm_span_result *r,
+                          struct found *found);
+#define X(name, keeps)                                                                             \
+    __attribute__((noinline)) static void finish_##name(                                           \
+        struct batch *b, const struct mpm_particles *s, struct mpm_span_result *r,                 \
+        struct found *found) {                                                                     \
+        const struct mpm_particles part = *s;                                                      \
+        finish(b, &part, r, found, DIM, MPM_LAW_##name);                                           \
+    }
+MPM_LAWS(X)
+#undef X
+static finish_lanes *const finish_of[MPM_N_LAWS] = {
+#define X(name, keeps) [MPM_LAW_##name] = finish_##name,
+    MPM_LAWS(X)
+#undef X
+};
+
 // eqs. 11-17 from what was gathered; with F-bar, what it will average.
 MPM_KERNEL void update(struct batch *b, const struct mpm_span *span, struct mpm_span_result *r,
                        struct found *found, const int dim, const enum mpm_law law,
@@ -851,7 +897,7 @@ MPM_KERNEL void update(struct batch *b, const struct mpm_span *span, struct mpm_
     FOR_VECTORS(in, DEFORMATION)
     found->v2_max = v2_max;
     if (scheme == MPM_FBAR_OFF) {
-        finish(b, &part, r, found, dim, law);
+        finish_of[law](b, &part, r, found);
     }
 }
 
@@ -864,7 +910,7 @@ MPM_KERNEL void finish_fbar(struct batch *b, const struct mpm_span *span,
     const struct extent in = b->in;
 #define RESCALE(whole) rescale(b, in, lane, &part, &by, r, dim, law, scheme, whole)
     FOR_VECTORS(in, RESCALE)
-    finish(b, &part, r, found, dim, law);
+    finish_of[law](b, &part, r, found);
 }
 
 // The records of what the particles give to their nodes. Lanes of other tiles are read, too: P2G
@@ -876,15 +922,15 @@ MPM_KERNEL void write_records(struct batch *b, const struct mpm_span *span, cons
     const double inv_h = span->grid->inv_h;
     const int n_sym = MPM_SYM(dim);
     for (int lane = 0; lane < in.end; lane += MPM_LANES) {
-        const mpm_vec V = mpm_load_aligned(at(s->V, in, lane, 1, 0)), zero = mpm_splat(0);
-        const mpm_vec m = s->density * mpm_load_aligned(at(s->V0, in, lane, 1, 0));
+        const mpm_vec V = fetch(in, lane, s->V, 1, 0, 0, true), zero = mpm_splat(0);
+        const mpm_vec m = s->density * fetch(in, lane, s->V0, 1, 0, 0, true);
         mpm_vec mv[3], f[6];
         UNROLL for (int d = 0; d < dim; d++) {
-            mv[d] = m * mpm_load_aligned(at(s->v, in, lane, dim, d));
+            mv[d] = m * fetch(in, lane, s->v, dim, d, 0, true);
         }
         const mpm_vec minus_V_over_h = V * -inv_h, V_fbar = fbar ? V : zero;
         UNROLL for (int k = 0; k < n_sym; k++) { // xx yy zz xy (yz zx)
-            f[k] = minus_V_over_h * mpm_load_aligned(at(s->sigma, in, lane, n_sym, k));
+            f[k] = minus_V_over_h * fetch(in, lane, s->sigma, n_sym, k, 0, true);
         }
         if (dim == 2) {
             const mpm_vec record[8] = {m, mv[0], mv[1], V_fbar, f[0], f[3], f[3], f[1]};
@@ -904,13 +950,16 @@ MPM_KERNEL void write_records(struct batch *b, const struct mpm_span *span, cons
 // other tiles.
 #define FOR_BATCHES(b, span)                                                                       \
     for (size_t first_ = (span)->begin / MPM_BLOCK * MPM_BLOCK;                                    \
-         first_ < (span)->end && batch_at((b), (span), first_); first_ += BATCH)
+         first_ < (span)->end && batch_at((b), (span), first_);                                    \
+         first_ += (size_t)(b)->in.end)
 
 MPM_KERNEL bool batch_at(struct batch *b, const struct mpm_span *span, size_t first) {
+    const size_t left = span->end - first;
     b->in = (struct extent){
         .first = first,
         .begin = span->begin > first ? (int)(span->begin - first) : 0,
-        .end = span->end - first < BATCH ? (int)(span->end - first) : BATCH,
+        .end = left <= MOST ? (int)left : BATCH,
+        .next = left <= MOST ? span->next / MPM_BLOCK * MPM_BLOCK : first + BATCH,
     };
     return true;
 }
@@ -920,6 +969,7 @@ MPM_KERNEL void p2g(const struct mpm_span *span, struct mpm_span_result *r, cons
     struct batch b;
     FOR_BATCHES(&b, span) {
         find_cells(&b, span, dim, basis);
+        find_nodes(&b, span->grid, dim, basis);
         write_weights(&b, span->s, dim, basis, true);
         write_records(&b, span, dim);
         scatter_records(&b, span->grid, dim, basis);
@@ -937,7 +987,7 @@ typedef void update_lanes(struct batch *b, const struct mpm_span *span, struct m
         update(b, span, r, found, DIM, MPM_LAW_##name, MPM_FBAR_##S);                              \
     }
 #define DEFINE_FINISH(name, S)                                                                     \
-    static void finish_##name##_##S(struct batch *b, const struct mpm_span *span,                  \
+    static void fbar_##name##_##S(struct batch *b, const struct mpm_span *span,                  \
                                     struct mpm_span_result *r, struct found *found) {              \
         finish_fbar(b, span, r, found, DIM, MPM_LAW_##name, MPM_FBAR_##S);                         \
     }
@@ -958,7 +1008,7 @@ static update_lanes *const updates[MPM_N_LAWS][MPM_N_FBAR_SCHEMES] = {
 };
 static update_lanes *const finishes[MPM_N_LAWS][MPM_N_FBAR_SCHEMES] = {
 #define X(name, keeps)                                                                             \
-    [MPM_LAW_##name] = {NULL, finish_##name##_ZHAO, finish_##name##_ANCHORED},
+    [MPM_LAW_##name] = {NULL, fbar_##name##_ZHAO, fbar_##name##_ANCHORED},
     MPM_LAWS(X)
 #undef X
 };
@@ -972,6 +1022,7 @@ MPM_KERNEL void g2p(const struct mpm_span *span, struct mpm_span_result *r, cons
     found_nothing(&found);
     FOR_BATCHES(&b, span) {
         find_cells(&b, span, dim, basis);
+        find_nodes(&b, span->grid, dim, basis);
         gather(&b, span, dim, basis, 0);
         update_batch(&b, span, r, &found);
         if (scheme != MPM_FBAR_OFF) {
@@ -995,6 +1046,7 @@ MPM_KERNEL void fbar(const struct mpm_span *span, struct mpm_span_result *r, con
     found_nothing(&found);
     FOR_BATCHES(&b, span) {
         find_cells(&b, span, dim, basis);
+        find_nodes(&b, span->grid, dim, basis);
         gather(&b, span, dim, basis, scalars);
         finish_batch(&b, span, r, &found);
     }

@@ -144,8 +144,8 @@ static struct mpm_sim *create(int which, struct block b) {
     w->body.velocity = (struct mpm_velocity){
         .kind = MPM_VELOCITY_MODE, .number = 2, .from = 4, .length = cells, .amplitude = 0.3};
     for (int k = 0; k < b.n_probes; k++) {
-        w->probes[k] =
-            (struct mpm_probe_def){.name = "probe", .kind = MPM_PROBE_ENERGY, .body = -1, .scale = 1};
+        w->probes[k] = (struct mpm_probe_def){
+            .name = "probe", .kind = MPM_PROBE_ENERGY, .body = -1, .scale = 1};
     }
     w->stage = (struct mpm_stage_def){.name = "main", .duration = 1e9};
     w->def.dimension = b.dim;
@@ -266,17 +266,18 @@ static void kernel_row(const char *group, struct block b, double goal) {
     char verdict[40] = "";
     if (goal > 0) {
         snprintf(verdict, sizeof verdict, "%s (goal %.1f, gate %.1f)",
-                 times >= goal         ? "met"
+                 times >= goal          ? "met"
                  : times >= goal / 1.25 ? "gate met"
                                         : "MISSED",
                  goal, goal / 1.25);
     }
-    printf("%dD %2.0f/cell %8zu %-8s %-8s %-17s %-6s %d thr %7.1f ns %6.1f M/s %5.2fx plain %3.0f %% of "
+    printf("%dD %2.0f/cell %8zu %-8s %-8s %-17s %-6s %d thr %7.1f ns %6.1f M/s %5.2fx plain %3.0f "
+           "%% of "
            "limit %4.0f B  %s\n",
            b.dim, pow(b.per_direction, b.dim), mpm_n_particles(fast), mpm_basis_name(b.basis),
-           mpm_fbar_name(b.scheme), material_names[b.material], mpm_isa_name(fast->isa), b.n_threads,
-           median(ns, rounds), 1e3 / median(ns, rounds), times, 100 * median(share, rounds),
-           bytes_per_particle(fast), verdict);
+           mpm_fbar_name(b.scheme), material_names[b.material], mpm_isa_name(fast->isa),
+           b.n_threads, median(ns, rounds), 1e3 / median(ns, rounds), times,
+           100 * median(share, rounds), bytes_per_particle(fast), verdict);
     fflush(stdout);
     open_row(group);
     describe(b, mpm_n_particles(fast));
@@ -311,9 +312,9 @@ static void kernels(void) {
     static const struct {
         int dim, per_direction;
         double n, goal[2]; // standard, F-bar
-    } cases[] = {{2, 2, 1e4, {6, 5.3}},  {2, 2, 1e5, {6, 5.3}},  {2, 2, 1e6, {6, 5.3}},
-                 {2, 4, 1e4, {7.5, 7}},  {2, 4, 1e5, {7.5, 7}},  {2, 4, 1e6, {7.5, 7}},
-                 {3, 2, 1e5, {6, 6}},    {3, 2, 1e6, {6, 6}}};
+    } cases[] = {{2, 2, 1e4, {6, 5.3}}, {2, 2, 1e5, {6, 5.3}}, {2, 2, 1e6, {6, 5.3}},
+                 {2, 4, 1e4, {7.5, 7}}, {2, 4, 1e5, {7.5, 7}}, {2, 4, 1e6, {7.5, 7}},
+                 {3, 2, 1e5, {6, 6}},   {3, 2, 1e6, {6, 6}}};
     for (size_t k = 0; k < sizeof cases / sizeof *cases; k++) {
         for (int scheme = 0; scheme < MPM_N_FBAR_SCHEMES; scheme++) {
             if (quick && cases[k].n > 1e5) {
@@ -345,8 +346,8 @@ static void kernels(void) {
     if (mpm_isa_in_use(MPM_ISA_AUTO) == MPM_ISA_AVX512) {
         puts("\nAVX2");
         for (int k = 0; k < 4; k++) {
-            struct block b = block_of(2 + k / 2, 2, k < 2 ? 1e4 : 1e5,
-                                      k % 2 ? MPM_FBAR_ZHAO : MPM_FBAR_OFF);
+            struct block b =
+                block_of(2 + k / 2, 2, k < 2 ? 1e4 : 1e5, k % 2 ? MPM_FBAR_ZHAO : MPM_FBAR_OFF);
             b.isa = MPM_ISA_AVX2;
             kernel_row("avx2", b, k < 2 ? 4 : 4.5);
         }
@@ -403,7 +404,8 @@ static void ratios(void) {
         return;
     }
     puts("\nOne against another, in turns");
-    const struct block std2 = block_of(2, 2, 1e4, MPM_FBAR_OFF), std3 = block_of(3, 2, 1e5, MPM_FBAR_OFF);
+    const struct block std2 = block_of(2, 2, 1e4, MPM_FBAR_OFF),
+                       std3 = block_of(3, 2, 1e5, MPM_FBAR_OFF);
     struct block one = std2, other = std2;
     one.scheme = MPM_FBAR_ZHAO;
     pair_row("ratios", "zhao / standard, 2D in cache", one, std2, 1.55);
@@ -419,20 +421,26 @@ static void ratios(void) {
     for (int dim = 2; dim <= 3; dim++) {
         one = other = block_of(dim, 2, dim == 2 ? 1e4 : 1e5, MPM_FBAR_ZHAO);
         one.basis = MPM_GIMP;
-        pair_row("ratios", dim == 2 ? "uGIMP / B-spline, 2D" : "uGIMP / B-spline, 3D", one, other, 1.05);
+        pair_row("ratios", dim == 2 ? "uGIMP / B-spline, 2D" : "uGIMP / B-spline, 3D", one, other,
+                 1.05);
         one = other;
         one.material = CLAY;
-        pair_row("ratios", dim == 2 ? "Hencky + J2, elastic / neo-Hookean, 2D"
-                                    : "Hencky + J2, elastic / neo-Hookean, 3D", one, other, 1.5);
+        pair_row("ratios",
+                 dim == 2 ? "Hencky + J2, elastic / neo-Hookean, 2D"
+                          : "Hencky + J2, elastic / neo-Hookean, 3D",
+                 one, other, 1.5);
         one.material = FLOWING;
-        pair_row("ratios", dim == 2 ? "Hencky + J2, all flowing / neo-Hookean, 2D"
-                                    : "Hencky + J2, all flowing / neo-Hookean, 3D", one, other, 1.5);
+        pair_row("ratios",
+                 dim == 2 ? "Hencky + J2, all flowing / neo-Hookean, 2D"
+                          : "Hencky + J2, all flowing / neo-Hookean, 3D",
+                 one, other, 1.5);
     }
     puts("\nTwo threads against one (wall time; no machine keeps its clock with both at work)");
     for (int dim = 2; dim <= 3; dim++) {
         one = other = block_of(dim, 2, 1e5, MPM_FBAR_ZHAO);
         one.n_threads = 2;
-        pair_row("threads", dim == 2 ? "two threads / one, 2D, 100k" : "two threads / one, 3D, 100k", one,
+        pair_row("threads",
+                 dim == 2 ? "two threads / one, 2D, 100k" : "two threads / one, 3D, 100k", one,
                  other, 0.55);
     }
     puts("\nOnly what a scene needs");
@@ -444,7 +452,8 @@ static void ratios(void) {
     pair_row("features", "F-bar switched off again / never on", one, other, 1.02);
     one = other = block_of(2, 2, 1e3, MPM_FBAR_ZHAO);
     one.room = 1000;
-    pair_row("features", "1,000 particles in 1,000 x 1,000 cells / in a tight domain", one, other, 1.15);
+    pair_row("features", "1,000 particles in 1,000 x 1,000 cells / in a tight domain", one, other,
+             1.15);
 }
 
 static void sorting(void) {
@@ -463,7 +472,8 @@ static void sorting(void) {
             mpm_sort(sim);
             steps[r] = (now() - t) / step;
         }
-        printf("%dD, 100k: a sort that finds all in order takes %.2f steps\n", dim, median(steps, rounds));
+        printf("%dD, 100k: a sort that finds all in order takes %.2f steps\n", dim,
+               median(steps, rounds));
         open_row("sort");
         number("dimension", dim);
         number("steps_per_sort", median(steps, rounds));
@@ -504,7 +514,8 @@ int main(int argc, char **argv) {
         } else if (strcmp(argv[k], "--json") == 0 && k + 1 < argc) {
             path = argv[++k];
         } else if (argv[k][0] == '-') {
-            fprintf(stderr, "usage: bench [--quick] [--json FILE] [kernels | ratios | sort | growth]\n");
+            fprintf(stderr,
+                    "usage: bench [--quick] [--json FILE] [kernels | ratios | sort | growth]\n");
             return 2;
         } else {
             filter = argv[k];

@@ -111,7 +111,8 @@ static void velocity_at(const struct mpm_sim *sim, const double *x, double *v) {
     double w[2][MPM_MAX_SUPPORT], dw[MPM_MAX_SUPPORT];
     int base[2];
     for (int d = 0; d < 2; d++) {
-        base[d] = (int)mpm_weights(sim->def->basis, (x[d] - g->origin[d]) / g->h, 0.25, 1, w[d], dw);
+        base[d] =
+            (int)mpm_weights(sim->def->basis, (x[d] - g->origin[d]) / g->h, 0.25, 1, w[d], dw);
         v[d] = 0;
     }
     for (int i = 0; i < reach; i++) {

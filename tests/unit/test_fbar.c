@@ -220,8 +220,8 @@ static void reference_step(const struct mpm_sim *before, const struct mpm_sim *a
                 int base[3] = {0};
                 for (int d = 0; d < dim; d++) {
                     const double x = s->x[mpm_at(p, dim, d)];
-                    base[d] = (int)mpm_weights(before->def->basis, (x - g->origin[d]) / g->h, s->half,
-                                          s->inv_4_half, w[d], dw);
+                    base[d] = (int)mpm_weights(before->def->basis, (x - g->origin[d]) / g->h,
+                                               s->half, s->inv_4_half, w[d], dw);
                     moved += pow(t->x[mpm_at(p, dim, d)] - x, 2);
                 }
                 const double V = s->V[p], J = mpm_ratio_in_use(s, p), dJ = t->dJ[p];

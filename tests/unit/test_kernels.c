@@ -49,8 +49,7 @@ static void define(int dim, int basis, int scheme, int kind, int cells, int per_
     world.material.name = "material";
     world.material.model = mpm_material_find(models[kind]);
     world.material.fbar = true;
-    world.body =
-        (struct mpm_body_def){.name = "block", .particles_per_direction = per_direction};
+    world.body = (struct mpm_body_def){.name = "block", .particles_per_direction = per_direction};
     for (int d = 0; d < dim; d++) {
         world.body.shape.max[d] = cells * H;
         world.def.domain_min[d] = -H;
