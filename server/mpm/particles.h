@@ -43,6 +43,11 @@ static inline size_t mpm_at(size_t p, int n_components, int c) {
     return (p / MPM_BLOCK * (size_t)n_components + (size_t)c) * MPM_BLOCK + p % MPM_BLOCK;
 }
 
+// The id of the particle at place p of the storage.
+static inline size_t mpm_particle_id(const struct mpm_particles *s, size_t p) {
+    return s->first_id + p;
+}
+
 // Volume ratio that the stress uses at particle p: det F; sqrt(det b), since plastic flow keeps the
 // volume; or Jbar of a fluid.
 static inline double mpm_ratio_in_use(const struct mpm_particles *s, size_t p) {
