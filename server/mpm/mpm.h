@@ -28,8 +28,9 @@
     X(FIELD, "field")                                                                              \
     X(REACTION, "reaction")                                                                        \
     X(MAXIMUM, "maximum")                                                                          \
-    X(MINIMUM, "minimum") X(MEAN, "mean") X(ERROR, "error") X(ENERGY, "energy")                    \
-        X(MOMENTUM, "momentum") X(DRIFT, "drift")
+    X(MINIMUM, "minimum")                                                                          \
+    X(MEAN, "mean") X(ERROR, "error") X(ENERGY, "energy") X(MOMENTUM, "momentum")                  \
+        X(DRIFT, "drift")
 // How an error is measured: RMS over the standard deviation of the reference, over its RMS; largest
 // over largest; and RMS itself, in the field's unit.
 #define MPM_NORM_LIST(X) X(RMS, "rms") X(L2, "l2") X(MAX, "max") X(ABSOLUTE, "absolute")
@@ -37,8 +38,9 @@
     X(ROTATION, "rotation")                                                                        \
     X(MODE, "mode")                                                                                \
     X(COLUMN, "column")                                                                            \
-    X(LAME, "lame") X(CYLINDER, "cylinder") X(TUBE, "tube") X(VORTEX, "vortex")                    \
-        X(TAYLOR_GREEN, "taylor_green") X(RITTER, "ritter")
+    X(LAME, "lame")                                                                                \
+    X(CYLINDER, "cylinder") X(TUBE, "tube") X(VORTEX, "vortex") X(TAYLOR_GREEN, "taylor_green")    \
+        X(RITTER, "ritter")
 
 enum mpm_basis {
 #define X(code, text) MPM_##code,

