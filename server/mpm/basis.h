@@ -15,6 +15,20 @@ MPM_KERNEL int mpm_support(const enum mpm_basis basis) {
     return basis == MPM_LINEAR ? 2 : basis == MPM_BSPLINE3 ? 4 : 3;
 }
 
+// The first node that a particle reaches: base of mpm_weights.
+MPM_KERNEL int mpm_base(const enum mpm_basis basis, const double xi, const double half) {
+    switch (basis) {
+    case MPM_LINEAR:
+        return (int)xi;
+    case MPM_GIMP:
+        return (int)(xi - half);
+    case MPM_BSPLINE2:
+        return (int)(xi - 0.5);
+    default:
+        return (int)xi - 1;
+    }
+}
+
 // Returns base. Of uGIMP only: `half` is half the particle's size in cells, at most 1/2, and
 // inv_4_half is 1/(4 half), which the caller divides once.
 MPM_KERNEL int mpm_weights(const enum mpm_basis basis, const double xi, const double half,

@@ -4,7 +4,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-bool mpm_wall_create(struct mpm_wall *wall, const struct mpm_wall_def *def,
+void mpm_wall_create(struct mpm_wall *wall, const struct mpm_wall_def *def,
                      const struct mpm_grid *grid, enum mpm_basis basis, bool wants_reaction) {
     *wall = (struct mpm_wall){.def = *def, .active = true, .wants_reaction = wants_reaction};
     const int axis = def->axis;
@@ -12,7 +12,6 @@ bool mpm_wall_create(struct mpm_wall *wall, const struct mpm_wall_def *def,
     wall->ghost = wall->plane + (def->keeps_above ? -1 : 1);
     wall->inner = wall->plane + (def->keeps_above ? 1 : -1);
     wall->folds = basis == MPM_BSPLINE2 || basis == MPM_BSPLINE3;
-    size_t columns = 1;
     for (int d = 0; d < MPM_MAX_DIM; d++) {
         wall->lo[d] = 0;
         wall->hi[d] = grid->n[d];
@@ -26,92 +25,224 @@ bool mpm_wall_create(struct mpm_wall *wall, const struct mpm_wall_def *def,
             wall->lo[d] = (int)fmax(0, ceil(from - slack));
             wall->hi[d] = (int)fmin(grid->n[d], floor(to + slack) + 1);
         }
-        columns *= (size_t)grid->n[d];
     }
     for (int d = 0; d < grid->dim; d++) {
         wall->wants_reaction |= def->velocity[d] != 0;
     }
-    if (wall->folds && def->condition == MPM_WALL_SEPARATE) {
-        wall->open = calloc(columns, 1);
-        if (!wall->open) {
-            return false;
-        }
-    }
-    if (wall->folds && wall->wants_reaction) {
-        wall->real = calloc(columns * 3 * (size_t)(1 + grid->dim), sizeof *wall->real);
-        return wall->real != NULL;
-    }
-    return true;
 }
 
 void mpm_wall_free(struct mpm_wall *wall) {
+    free(wall->column);
+    free(wall->beyond);
     free(wall->real);
     free(wall->open);
     *wall = (struct mpm_wall){0};
 }
 
-// The wall's columns inside the window: for each, `column` is its node in plane 0 of the wall's
-// axis and `k` counts them.
-#define FOR_COLUMNS(wall, g, column, k)                                                            \
-    for (int u_ = (wall)->def.axis == 0 ? 1 : 0,                                                   \
-             w_ = (g)->dim == 2           ? 2                                                      \
-                  : (wall)->def.axis == 2 ? 1                                                      \
-                                          : 2,                                                     \
-             ua_ = first_of(wall, g, u_), ub_ = last_of(wall, g, u_), wa_ = first_of(wall, g, w_), \
-             wb_ = last_of(wall, g, w_), i_ = ua_;                                                 \
-         i_ < ub_; i_++)                                                                           \
-        for (int j_ = wa_; j_ < wb_; j_++)                                                         \
-            for (size_t column = (size_t)i_ * (g)->stride[u_] + (size_t)j_ * (g)->stride[w_],      \
-                        k = (size_t)i_ * (size_t)(g)->n[w_] + (size_t)j_, once_ = 1;               \
-                 once_; once_ = 0)
+// ---- The walls' nodes ----
 
-static int first_of(const struct mpm_wall *w, const struct mpm_grid *g, int d) {
-    return d >= g->dim ? 0 : w->lo[d] > g->lo[d] ? w->lo[d] : g->lo[d];
-}
-
-static int last_of(const struct mpm_wall *w, const struct mpm_grid *g, int d) {
-    return d >= g->dim ? 1 : w->hi[d] < g->hi[d] ? w->hi[d] : g->hi[d];
-}
-
-// Whether plane i of the wall's axis lies in the window.
-static bool in_window(const struct mpm_wall *w, const struct mpm_grid *g, int i) {
-    return i >= g->lo[w->def.axis] && i < g->hi[w->def.axis];
-}
-
-static bool reaches_window(const struct mpm_wall *w, const struct mpm_grid *g) {
-    return in_window(w, g, w->ghost) && in_window(w, g, w->inner);
-}
-
-void mpm_walls_extend_window(const struct mpm_wall *walls, size_t n_walls, struct mpm_grid *g) {
-    for (size_t k = 0; k < n_walls; k++) {
-        const struct mpm_wall *w = &walls[k];
-        const int axis = w->def.axis;
-        if (w->active && w->folds && w->plane >= g->lo[axis] - 1 && w->plane <= g->hi[axis]) {
-            g->lo[axis] = w->plane - 1 < g->lo[axis] ? w->plane - 1 : g->lo[axis];
-            g->hi[axis] = w->plane + 2 > g->hi[axis] ? w->plane + 2 : g->hi[axis];
+// Whether a place lies within the wall in all directions but its normal.
+static bool in_span(const struct mpm_wall *w, const int *place, int dim) {
+    for (int d = 0; d < dim; d++) {
+        if (d != w->def.axis && (place[d] < w->lo[d] || place[d] >= w->hi[d])) {
+            return false;
         }
     }
+    return true;
 }
+
+// The same of any node of a block.
+static bool block_in_span(const struct mpm_wall *w, const int *block, int dim) {
+    for (int d = 0; d < dim; d++) {
+        if (d != w->def.axis &&
+            (block[d] * MPM_EDGE + MPM_EDGE - 1 < w->lo[d] || block[d] * MPM_EDGE >= w->hi[d])) {
+            return false;
+        }
+    }
+    return true;
+}
+
+bool mpm_walls_activate(const struct mpm_wall *walls, size_t n_walls, struct mpm_grid *g) {
+    uint32_t before;
+    do { // what one wall adds may touch another
+        before = g->n_slots;
+        for (size_t k = 0; k < n_walls; k++) {
+            const struct mpm_wall *w = &walls[k];
+            const int planes[] = {w->ghost, w->plane, w->inner}, axis = w->def.axis;
+            for (uint32_t s = 1; w->active && w->folds && s < g->n_slots; s++) {
+                int block[MPM_MAX_DIM];
+                mpm_grid_block_place(g, g->block[s], block);
+                const int first = block[axis] * MPM_EDGE;
+                bool near = false;
+                for (int q = 0; q < 3; q++) {
+                    near |= planes[q] >= first && planes[q] < first + MPM_EDGE;
+                }
+                if (!near || !block_in_span(w, block, g->dim)) {
+                    continue;
+                }
+                for (int q = 0; q < 3; q++) {
+                    block[axis] = planes[q] / MPM_EDGE;
+                    if (!mpm_grid_activate(g, block)) {
+                        return false;
+                    }
+                }
+            }
+        }
+    } while (g->n_slots > before);
+    return true;
+}
+
+// Room for one more element; what is new is not set.
+static bool room_for(void *array, size_t n, size_t *capacity, size_t width) {
+    if (n < *capacity) {
+        return true;
+    }
+    const size_t wider = *capacity + *capacity / 2 + 64;
+    void *memory = realloc(*(void **)array, wider * width);
+    if (memory) {
+        *(void **)array = memory;
+        *capacity = wider;
+    }
+    return memory != NULL;
+}
+
+static int by_plane(const void *one, const void *other) {
+    const uint32_t a = ((const struct mpm_column *)one)->plane,
+                   b = ((const struct mpm_column *)other)->plane;
+    return (a > b) - (a < b);
+}
+
+// The column through a place, or NULL where the plane's node does not exist. Columns ascend by
+// their plane node, as the blocks do.
+static const struct mpm_column *column_through(const struct mpm_wall *w, const struct mpm_grid *g,
+                                               const int *place) {
+    int at[MPM_MAX_DIM] = {place[0], place[1], place[2]};
+    at[w->def.axis] = w->plane;
+    const struct mpm_column key = {.plane = mpm_node_at(g, at)};
+    return bsearch(&key, w->column, w->n_columns, sizeof key, by_plane);
+}
+
+static bool add_column(struct mpm_wall *w, const struct mpm_grid *g, const int *place) {
+    const int axis = w->def.axis;
+    struct mpm_column c = {.plane = mpm_node_at(g, place)};
+    memcpy(c.place, place, sizeof c.place);
+    if (w->folds) {
+        int at[MPM_MAX_DIM] = {place[0], place[1], place[2]};
+        at[axis] = w->ghost;
+        c.ghost = mpm_node_at(g, at);
+        at[axis] = w->inner;
+        c.inner = mpm_node_at(g, at);
+    }
+    if (!room_for(&w->column, w->n_columns, &w->capacity, sizeof c)) {
+        return false;
+    }
+    w->column[w->n_columns++] = c;
+    return true;
+}
+
+// Calls `add` for every existing node within the wall's span whose place along the axis lies in
+// [first, last].
+static bool each_node(struct mpm_wall *w, const struct mpm_grid *g, int first, int last,
+                      bool (*add)(struct mpm_wall *, const struct mpm_grid *, const int *)) {
+    const int dim = g->dim, axis = w->def.axis;
+    for (uint32_t s = 1; s < g->n_slots; s++) {
+        int block[MPM_MAX_DIM], place[MPM_MAX_DIM] = {0};
+        mpm_grid_block_place(g, g->block[s], block);
+        if (block[axis] * MPM_EDGE > last || block[axis] * MPM_EDGE + MPM_EDGE - 1 < first ||
+            !block_in_span(w, block, dim)) {
+            continue;
+        }
+        for (int i = 0; i < MPM_BLOCK_NODES(dim); i++) {
+            for (int d = 0; d < dim; d++) {
+                place[d] = block[d] * MPM_EDGE + (i >> 2 * (dim - 1 - d) & 3);
+            }
+            if (place[axis] >= first && place[axis] <= last && in_span(w, place, dim) &&
+                !add(w, g, place)) {
+                return false;
+            }
+        }
+    }
+    return true;
+}
+
+static bool add_beyond(struct mpm_wall *w, const struct mpm_grid *g, const int *place) {
+    const struct mpm_column *through = column_through(w, g, place);
+    if (!room_for(&w->beyond, w->n_beyond, &w->beyond_capacity, sizeof *w->beyond)) {
+        return false;
+    }
+    w->beyond[w->n_beyond++] = (struct mpm_beyond){
+        .node = mpm_node_at(g, place),
+        .column = through ? (uint32_t)(through - w->column) : UINT32_MAX,
+    };
+    return true;
+}
+
+bool mpm_walls_find_nodes(struct mpm_wall *walls, size_t n_walls, const struct mpm_grid *g) {
+    for (size_t k = 0; k < n_walls; k++) {
+        struct mpm_wall *w = &walls[k];
+        const int end = g->n[w->def.axis] - 1;
+        const size_t before = w->capacity;
+        w->n_columns = w->n_beyond = 0;
+        if (!w->active) {
+            continue;
+        }
+        if (!w->folds) { // all nodes on it and beyond
+            if (!each_node(w, g, w->def.keeps_above ? 0 : w->plane,
+                           w->def.keeps_above ? w->plane : end, add_column)) {
+                return false;
+            }
+            continue;
+        }
+        if (!each_node(w, g, w->plane, w->plane, add_column) ||
+            !each_node(w, g, w->def.keeps_above ? 0 : w->ghost + 1,
+                       w->def.keeps_above ? w->ghost - 1 : end, add_beyond)) {
+            return false;
+        }
+        if (w->capacity > before) {
+            free(w->real);
+            free(w->open);
+            const bool separates = w->def.condition == MPM_WALL_SEPARATE;
+            w->open = separates ? calloc(w->capacity, 1) : NULL;
+            w->real = w->wants_reaction
+                          ? calloc(w->capacity * 3 * (size_t)(1 + g->dim), sizeof *w->real)
+                          : NULL;
+            if ((separates && !w->open) || (w->wants_reaction && !w->real)) {
+                w->capacity = 0;
+                return false;
+            }
+        }
+    }
+    return true;
+}
+
+// ---- Conditions ----
 
 // +1 where the component is the same in the mirror image, -1 where it changes sign.
 static double parity(const struct mpm_wall *w, int component) {
     return component == w->def.axis || w->def.condition == MPM_WALL_FIXED ? -1 : 1;
 }
 
+static double *sums(const struct mpm_grid *g, uint32_t node) {
+    return g->node + (size_t)node * MPM_NODE;
+}
+
+static double *result(const struct mpm_grid *g, uint32_t node) {
+    return g->velocity + (size_t)node * (size_t)MPM_VELOCITY(g->dim);
+}
+
 // Keeps m and f of the three planes before anything is folded, for the reaction.
 static void keep_real(struct mpm_wall *w, const struct mpm_grid *g, const double *gravity) {
-    const int dim = g->dim, planes[3] = {w->ghost, w->plane, w->inner};
-    const size_t stride = g->stride[w->def.axis];
+    const int dim = g->dim;
     double *out = w->real;
-    FOR_COLUMNS(w, g, column, k) {
+    for (const struct mpm_column *c = w->column; c < w->column + w->n_columns; c++) {
+        const uint32_t nodes[] = {c->ghost, c->plane, c->inner};
         for (int q = 0; q < 3; q++, out += 1 + dim) {
-            const double *node = g->node + (column + (size_t)planes[q] * stride) * MPM_NODE(dim);
+            const double *node = sums(g, nodes[q]);
             out[0] = node[0];
             for (int d = 0; d < dim; d++) {
                 out[1 + d] = node[1 + dim + d] + node[0] * gravity[d];
             }
         }
-        (void)k;
     }
 }
 
@@ -120,25 +251,24 @@ static void keep_real(struct mpm_wall *w, const struct mpm_grid *g, const double
 static void open_columns(const struct mpm_wall *walls, size_t n_walls, struct mpm_wall *w,
                          const struct mpm_grid *g, const double *gravity, double dt) {
     const int dim = g->dim, axis = w->def.axis;
-    FOR_COLUMNS(w, g, column, k) {
-        const double *plane =
-            g->node + (column + (size_t)w->plane * g->stride[axis]) * MPM_NODE(dim);
-        const double m = plane[0];
+    for (size_t k = 0; k < w->n_columns; k++) {
+        const double *plane = sums(g, w->column[k].plane), m = plane[0];
         const double v = m > 0 ? (plane[1 + axis] + dt * plane[1 + dim + axis]) / m +
                                      dt * gravity[axis] - w->def.velocity[axis]
                                : 0;
         w->open[k] = w->def.keeps_above ? v > 0 : v < 0;
     }
     for (const struct mpm_wall *o = walls; o < walls + n_walls; o++) {
-        if (!o->active || !o->folds || o->def.axis == axis || !reaches_window(o, g)) {
+        if (!o->active || !o->folds || o->def.axis == axis) {
             continue;
         }
-        FOR_COLUMNS(w, g, column, k) {
-            (void)column;
-            if (o->def.axis == u_ && i_ == o->ghost) {
-                w->open[k] = w->open[(size_t)o->inner * (size_t)g->n[w_] + (size_t)j_];
-            } else if (o->def.axis == w_ && j_ == o->ghost) {
-                w->open[k] = w->open[(size_t)i_ * (size_t)g->n[w_] + (size_t)o->inner];
+        for (size_t k = 0; k < w->n_columns; k++) {
+            int place[MPM_MAX_DIM];
+            memcpy(place, w->column[k].place, sizeof place);
+            if (place[o->def.axis] == o->ghost && in_span(o, place, dim)) {
+                place[o->def.axis] = o->inner;
+                const struct mpm_column *image = column_through(w, g, place);
+                w->open[k] = image ? w->open[image - w->column] : w->open[k];
             }
         }
     }
@@ -146,13 +276,11 @@ static void open_columns(const struct mpm_wall *walls, size_t n_walls, struct mp
 
 static void fold(const struct mpm_wall *w, struct mpm_grid *g, const double *gravity) {
     const int dim = g->dim;
-    const size_t stride = g->stride[w->def.axis];
-    FOR_COLUMNS(w, g, column, k) {
-        double *ghost = g->node + (column + (size_t)w->ghost * stride) * MPM_NODE(dim);
-        double *inner = g->node + (column + (size_t)w->inner * stride) * MPM_NODE(dim);
+    for (size_t k = 0; k < w->n_columns; k++) {
         if (w->open && w->open[k]) {
             continue;
         }
+        double *ghost = sums(g, w->column[k].ghost), *inner = sums(g, w->column[k].inner);
         const double m_ghost = ghost[0];
         for (int d = 0; d < dim; d++) {
             const double s = parity(w, d), v_wall = w->def.velocity[d];
@@ -174,23 +302,22 @@ static void fold(const struct mpm_wall *w, struct mpm_grid *g, const double *gra
 // The folding walls in the order in which they fold, k = 0 .. 2 n_walls - 1, with NULL for gaps:
 // those that separate come last, so that each of their columns decides with all that its images
 // bring.
-static struct mpm_wall *in_order(struct mpm_wall *walls, size_t n_walls, const struct mpm_grid *g,
-                                 size_t k) {
+static struct mpm_wall *in_order(struct mpm_wall *walls, size_t n_walls, size_t k) {
     struct mpm_wall *w = &walls[k % n_walls];
     const bool separates = w->def.condition == MPM_WALL_SEPARATE;
-    return w->active && w->folds && separates == (k >= n_walls) && reaches_window(w, g) ? w : NULL;
+    return w->active && w->folds && separates == (k >= n_walls) ? w : NULL;
 }
 
 void mpm_walls_fold(struct mpm_wall *walls, size_t n_walls, struct mpm_grid *g,
                     const double *gravity, double dt) {
     for (size_t k = 0; k < n_walls; k++) {
         struct mpm_wall *w = &walls[k];
-        if (w->active && w->folds && w->wants_reaction && reaches_window(w, g)) {
+        if (w->active && w->folds && w->wants_reaction) {
             keep_real(w, g, gravity);
         }
     }
     for (size_t k = 0; k < 2 * n_walls; k++) {
-        struct mpm_wall *w = in_order(walls, n_walls, g, k);
+        struct mpm_wall *w = in_order(walls, n_walls, k);
         if (w && w->open) {
             open_columns(walls, n_walls, w, g, gravity, dt);
         }
@@ -220,13 +347,10 @@ static void condition(const struct mpm_wall *w, double *velocity, int dim) {
 static bool set_before(const struct mpm_wall *walls, const struct mpm_wall *w, const int *place,
                        int d, int dim) {
     for (const struct mpm_wall *o = walls; o < w; o++) {
-        bool in =
-            o->active && !o->folds && parity(o, d) < 0 &&
-            (o->def.keeps_above ? place[o->def.axis] <= o->plane : place[o->def.axis] >= o->plane);
-        for (int e = 0; e < dim; e++) {
-            in &= e == o->def.axis || (place[e] >= o->lo[e] && place[e] < o->hi[e]);
-        }
-        if (in) {
+        const int along = place[o->def.axis];
+        if (o->active && !o->folds && parity(o, d) < 0 &&
+            (o->def.keeps_above ? along <= o->plane : along >= o->plane) &&
+            in_span(o, place, dim)) {
             return true;
         }
     }
@@ -237,45 +361,33 @@ static bool set_before(const struct mpm_wall *walls, const struct mpm_wall *w, c
 // anything) and momentum would have done but for the condition is the force on the wall.
 static void apply_direct(const struct mpm_wall *walls, struct mpm_wall *w, struct mpm_grid *g,
                          const double *gravity, double dt) {
-    const int dim = g->dim, axis = w->def.axis;
-    const int first = w->def.keeps_above ? g->lo[axis] : (int)fmax(w->plane, g->lo[axis]);
-    const int last = w->def.keeps_above ? (int)fmin(w->plane + 1, g->hi[axis]) : g->hi[axis];
+    const int dim = g->dim;
     memset(w->reaction, 0, sizeof w->reaction);
-    FOR_COLUMNS(w, g, column, k) {
-        int place[MPM_MAX_DIM] = {0};
-        for (int e = 0; e < dim; e++) {
-            place[e] = (int)(column / g->stride[e] % (size_t)g->n[e]);
+    for (const struct mpm_column *c = w->column; c < w->column + w->n_columns; c++) {
+        const double *node = sums(g, c->plane), m = node[0], *f = node + 1 + dim;
+        if (!(m > 0)) {
+            continue;
         }
-        for (int i = first; i < last; i++) {
-            const size_t node = column + (size_t)i * g->stride[axis];
-            const double m = g->node[node * MPM_NODE(dim)];
-            if (m > 0) {
-                const double *f = g->node + node * MPM_NODE(dim) + 1 + dim;
-                double *v = g->velocity + node * MPM_VELOCITY(dim), before[MPM_MAX_DIM];
-                memcpy(before, v, (size_t)dim * sizeof *v);
-                condition(w, v, dim);
-                place[axis] = i;
-                for (int d = 0; d < dim; d++) {
-                    if (v[d] != before[d]) {
-                        w->reaction[d] += set_before(walls, w, place, d, dim)
-                                              ? m * (before[d] - v[d]) / dt
-                                              : f[d] + m * gravity[d] - m * v[dim + d] / dt;
-                    }
-                }
+        double *v = result(g, c->plane), before[MPM_MAX_DIM];
+        memcpy(before, v, (size_t)dim * sizeof *v);
+        condition(w, v, dim);
+        for (int d = 0; d < dim; d++) {
+            if (v[d] != before[d]) {
+                w->reaction[d] += set_before(walls, w, c->place, d, dim)
+                                      ? m * (before[d] - v[d]) / dt
+                                      : f[d] + m * gravity[d] - m * v[dim + d] / dt;
             }
         }
-        (void)k;
     }
 }
 
 static void hold_plane(const struct mpm_wall *w, struct mpm_grid *g) {
     const int dim = g->dim;
-    FOR_COLUMNS(w, g, column, k) {
+    for (size_t k = 0; k < w->n_columns; k++) {
         if (w->open && w->open[k]) {
             continue;
         }
-        double *plane =
-            g->velocity + (column + (size_t)w->plane * g->stride[w->def.axis]) * MPM_VELOCITY(dim);
+        double *plane = result(g, w->column[k].plane);
         for (int d = 0; d < dim; d++) {
             if (parity(w, d) < 0) {
                 // FLIP sees the increment from the velocity before the condition, as everywhere.
@@ -287,39 +399,35 @@ static void hold_plane(const struct mpm_wall *w, struct mpm_grid *g) {
 }
 
 static void fill_ghosts(const struct mpm_wall *w, struct mpm_grid *g) {
-    const int dim = g->dim, axis = w->def.axis;
-    const size_t stride = g->stride[axis];
-    FOR_COLUMNS(w, g, column, k) {
+    const int dim = g->dim;
+    for (size_t k = 0; k < w->n_columns; k++) {
         if (w->open && w->open[k]) {
             continue;
         }
-        double *ghost = g->velocity + (column + (size_t)w->ghost * stride) * MPM_VELOCITY(dim);
-        const double *inner =
-            g->velocity + (column + (size_t)w->inner * stride) * MPM_VELOCITY(dim);
+        double *ghost = result(g, w->column[k].ghost);
+        const double *inner = result(g, w->column[k].inner);
         for (int d = 0; d < dim; d++) {
             const double s = parity(w, d);
             ghost[d] = s * inner[d] + (s < 0 ? 2 * w->def.velocity[d] : 0);
             ghost[dim + d] = s * inner[dim + d];
         }
-        // What has come to lie beyond the image's reach is held as by a direct condition.
-        const int step = w->ghost - w->plane;
-        for (int i = w->ghost + step; in_window(w, g, i); i += step) {
-            condition(w, g->velocity + (column + (size_t)i * stride) * MPM_VELOCITY(dim), dim);
+    }
+    // What has come to lie beyond the image's reach is held as by a direct condition.
+    for (const struct mpm_beyond *b = w->beyond; b < w->beyond + w->n_beyond; b++) {
+        if (!(w->open && b->column != UINT32_MAX && w->open[b->column])) {
+            condition(w, result(g, b->node), dim);
         }
     }
 }
 
 // Whether a folding wall sets component d of the node with the given place in the grid.
 static bool holds(const struct mpm_wall *w, const struct mpm_grid *g, const int *place, int d) {
-    if (!w->active || !w->folds || !reaches_window(w, g) || parity(w, d) > 0) {
+    if (!w->active || !w->folds || parity(w, d) > 0 || abs(place[w->def.axis] - w->plane) > 1 ||
+        !in_span(w, place, g->dim)) {
         return false;
     }
-    bool in = abs(place[w->def.axis] - w->plane) <= 1;
-    for (int e = 0; e < g->dim; e++) {
-        in &= e == w->def.axis || (place[e] >= w->lo[e] && place[e] < w->hi[e]);
-    }
-    const int u = w->def.axis == 0 ? 1 : 0, v = g->dim == 2 ? 2 : w->def.axis == 2 ? 1 : 2;
-    return in && !(w->open && w->open[(size_t)place[u] * (size_t)g->n[v] + (size_t)place[v]]);
+    const struct mpm_column *through = w->open ? column_through(w, g, place) : NULL;
+    return !(through && w->open[through - w->column]);
 }
 
 // Real momentum change of the three planes less what forces gave them: that came from the wall.
@@ -328,17 +436,14 @@ static bool holds(const struct mpm_wall *w, const struct mpm_grid *g, const int 
 static void folded_reaction(const struct mpm_wall *walls, struct mpm_wall *w,
                             const struct mpm_grid *g, double dt) {
     const int dim = g->dim, axis = w->def.axis, planes[3] = {w->ghost, w->plane, w->inner};
-    const size_t stride = g->stride[axis];
     const double *real = w->real;
     memset(w->reaction, 0, sizeof w->reaction);
-    FOR_COLUMNS(w, g, column, k) {
-        int place[MPM_MAX_DIM] = {0};
-        for (int e = 0; e < dim; e++) {
-            place[e] = (int)(column / g->stride[e] % (size_t)g->n[e]);
-        }
+    for (const struct mpm_column *c = w->column; c < w->column + w->n_columns; c++) {
+        const uint32_t nodes[] = {c->ghost, c->plane, c->inner};
+        int place[MPM_MAX_DIM];
+        memcpy(place, c->place, sizeof place);
         for (int q = 0; q < 3; q++, real += 1 + dim) {
-            const double *v =
-                g->velocity + (column + (size_t)planes[q] * stride) * MPM_VELOCITY(dim);
+            const double *v = result(g, nodes[q]);
             place[axis] = planes[q];
             for (int d = 0; d < dim; d++) {
                 bool mine = holds(w, g, place, d);
@@ -350,7 +455,6 @@ static void folded_reaction(const struct mpm_wall *walls, struct mpm_wall *w,
                 }
             }
         }
-        (void)k;
     }
 }
 
@@ -364,13 +468,13 @@ void mpm_walls_apply(struct mpm_wall *walls, size_t n_walls, struct mpm_grid *g,
     // All planes before any ghost: of two walls one cell apart, each one's plane is the other's
     // inner plane. Backwards: the corner's ghost is the image of an image.
     for (size_t k = 2 * n_walls; k-- > 0;) {
-        const struct mpm_wall *w = in_order(walls, n_walls, g, k);
+        const struct mpm_wall *w = in_order(walls, n_walls, k);
         if (w) {
             hold_plane(w, g);
         }
     }
     for (size_t k = 2 * n_walls; k-- > 0;) {
-        const struct mpm_wall *w = in_order(walls, n_walls, g, k);
+        const struct mpm_wall *w = in_order(walls, n_walls, k);
         if (w) {
             fill_ghosts(w, g);
         }
@@ -378,49 +482,37 @@ void mpm_walls_apply(struct mpm_wall *walls, size_t n_walls, struct mpm_grid *g,
     for (size_t k = 0; k < n_walls; k++) {
         struct mpm_wall *w = &walls[k];
         if (w->active && w->folds && w->wants_reaction) {
-            if (reaches_window(w, g)) {
-                folded_reaction(walls, w, g, dt);
-            } else {
-                memset(w->reaction, 0, sizeof w->reaction);
-            }
+            folded_reaction(walls, w, g, dt);
         }
     }
 }
 
 void mpm_walls_fold_fbar(const struct mpm_wall *walls, size_t n_walls, struct mpm_grid *g) {
-    const int stride = g->fbar_stride;
+    const int volume = MPM_NODE_VOLUME(g->dim), stride = g->fbar_stride;
     // Sums first, so that the image of an image is folded too; then the ghosts take their image's
     // value.
     for (size_t k = 0; k < n_walls; k++) {
         const struct mpm_wall *w = &walls[k];
-        if (!w->active || !w->folds || !reaches_window(w, g)) {
-            continue;
-        }
-        FOR_COLUMNS(w, g, column, c) {
-            const size_t plane_stride = g->stride[w->def.axis];
-            double *ghost = g->fbar + (column + (size_t)w->ghost * plane_stride) * (size_t)stride;
-            double *inner = g->fbar + (column + (size_t)w->inner * plane_stride) * (size_t)stride;
+        for (size_t c = 0; w->active && w->folds && c < w->n_columns; c++) {
+            const size_t from = w->column[c].ghost, to = w->column[c].inner;
+            g->node[to * MPM_NODE + (size_t)volume] += g->node[from * MPM_NODE + (size_t)volume];
+            g->node[from * MPM_NODE + (size_t)volume] = 0;
+            double *ghost = g->fbar + from * (size_t)stride, *inner = g->fbar + to * (size_t)stride;
             for (int q = 0; q < stride; q++) {
                 inner[q] += ghost[q];
                 ghost[q] = 0;
             }
-            (void)c;
         }
     }
 }
 
 void mpm_walls_mirror_fbar(const struct mpm_wall *walls, size_t n_walls, struct mpm_grid *g) {
+    const size_t stride = (size_t)g->fbar_stride;
     for (size_t k = n_walls; k-- > 0;) {
         const struct mpm_wall *w = &walls[k];
-        if (!w->active || !w->folds || !reaches_window(w, g)) {
-            continue;
-        }
-        FOR_COLUMNS(w, g, column, c) {
-            const size_t plane_stride = g->stride[w->def.axis], stride = (size_t)g->fbar_stride;
-            double *ghost = g->fbar + (column + (size_t)w->ghost * plane_stride) * stride;
-            const double *inner = g->fbar + (column + (size_t)w->inner * plane_stride) * stride;
-            memcpy(ghost, inner, stride * sizeof *ghost);
-            (void)c;
+        for (size_t c = 0; w->active && w->folds && c < w->n_columns; c++) {
+            memcpy(g->fbar + w->column[c].ghost * stride, g->fbar + w->column[c].inner * stride,
+                   stride * sizeof *g->fbar);
         }
     }
 }

@@ -8,6 +8,13 @@
 #pragma once
 #include "server/mpm/grid.h"
 
+// One line of nodes across a wall: ghost, plane and inner node (numbers) of a folding wall. Of a
+// direct one `plane` is any node on or beyond it, and the others are unused.
+struct mpm_column {
+    uint32_t ghost, plane, inner;
+    int place[MPM_MAX_DIM]; // of the plane node
+};
+
 struct mpm_wall {
     struct mpm_wall_def def;
     bool active, folds;                   // in force; mirror-folded (B-splines)
@@ -16,15 +23,30 @@ struct mpm_wall {
     int lo[MPM_MAX_DIM], hi[MPM_MAX_DIM]; // its nodes in the other directions: lo <= i < hi
     bool wants_reaction;                  // a probe asks for it, or the wall moves
     double reaction[MPM_MAX_DIM];         // N, force on the wall in the last step
-    // (nodes of three planes in the window; m, f) before folding, where the reaction is wanted
-    double *real;
-    unsigned char *open; // (nodes of the plane) a `separate` column that leaves its wall
+
+    // Its nodes among the grid's blocks: mpm_walls_find_nodes.
+    size_t n_columns, capacity;
+    struct mpm_column *column;
+    size_t n_beyond, beyond_capacity;
+    struct mpm_beyond *beyond; // nodes behind the ghosts of a folding wall, and their columns
+    double *real;        // (columns, 3 planes; m, f) before folding, where the reaction is wanted
+    unsigned char *open; // (columns) one of `separate` that leaves its wall
+};
+struct mpm_beyond {
+    uint32_t node, column;
 };
 
-// `wants_reaction`: a probe asks for it. False when memory is short.
-bool mpm_wall_create(struct mpm_wall *wall, const struct mpm_wall_def *def,
+// `wants_reaction`: a probe asks for it.
+void mpm_wall_create(struct mpm_wall *wall, const struct mpm_wall_def *def,
                      const struct mpm_grid *grid, enum mpm_basis basis, bool wants_reaction);
 void mpm_wall_free(struct mpm_wall *wall);
+
+// Adds to the grid's blocks what folding walls need: where one of a column's three nodes exists,
+// all do. False when memory is short.
+bool mpm_walls_activate(const struct mpm_wall *walls, size_t n_walls, struct mpm_grid *grid);
+// Finds the walls' nodes among the blocks: whenever these, or which walls are active, have changed.
+// False when memory is short.
+bool mpm_walls_find_nodes(struct mpm_wall *walls, size_t n_walls, const struct mpm_grid *grid);
 
 // Before the nodes move: folds mass, momentum and force of the ghost nodes (B-splines only).
 void mpm_walls_fold(struct mpm_wall *walls, size_t n_walls, struct mpm_grid *grid,
@@ -32,8 +54,7 @@ void mpm_walls_fold(struct mpm_wall *walls, size_t n_walls, struct mpm_grid *gri
 // After: the condition on v^{n+1} (and, where folded, the ghost nodes' values), and the reactions.
 void mpm_walls_apply(struct mpm_wall *walls, size_t n_walls, struct mpm_grid *grid,
                      const double *gravity, double dt);
-// Folds the sums that F-bar averages (even); and, once they are averages, gives the ghosts theirs.
+// Folds the volume and the sums that F-bar averages (even); and, once they are averages, gives the
+// ghosts theirs.
 void mpm_walls_fold_fbar(const struct mpm_wall *walls, size_t n_walls, struct mpm_grid *grid);
 void mpm_walls_mirror_fbar(const struct mpm_wall *walls, size_t n_walls, struct mpm_grid *grid);
-// Widens the window so that a folding wall in it lies in it with all its three planes.
-void mpm_walls_extend_window(const struct mpm_wall *walls, size_t n_walls, struct mpm_grid *grid);

@@ -8,8 +8,8 @@
 
 #define MAX_PER_DIRECTION 32 // particles per cell and direction: beyond it a smaller cell is meant
 #define MAX_PARTICLES 2000000000.0 // ids are 32 bits
-#define MAX_NODES 4000000000.0
-#define MAX_STEPS 1e15            // beyond it doubles soon no longer count one by one
+#define MAX_NODES 1e9  // with whole blocks of 4 a direction, node numbers still fit 32 bits
+#define MAX_STEPS 1e15 // beyond it doubles soon no longer count one by one
 #define NODE_PLANE_TOLERANCE 1e-6 // cells: round-off of a wall's place, far below any offset meant
 
 static double largest_speed(const struct mpm_def *def) {
@@ -400,7 +400,7 @@ static bool check_body(struct report *r, const struct mpm_def *def, size_t b, do
     *total += bound;
     if (!(*total <= MAX_PARTICLES) ||
         (def->memory_limit && (double)mpm_particles_bytes(def->materials[body->material].model,
-                                                          def->dimension, 1, false, false, false) /
+                                                          def->dimension, 1, 0, false) /
                                       MPM_BLOCK * bound / 4 >
                                   (double)def->memory_limit)) {
         FAULT(

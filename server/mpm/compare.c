@@ -68,7 +68,7 @@ static bool choose(struct mpm_compare *c, const struct mpm_sim *sim,
             return false;
         }
         for (size_t k = 0; k < picked.n; k++) {
-            c->chosen[mpm_particle_id(s, picked.particle[k])] = 1;
+            c->chosen[s->first_id + picked.particle[k]] = 1;
         }
         mpm_load_free(&picked);
     }

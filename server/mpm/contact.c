@@ -202,7 +202,7 @@ static double length_of(const double *v, int dim) {
 static void friction(struct mpm_rigid *rigid, const struct mpm_particles *s, size_t p,
                      const double *normal, double push, double dt, double *force) {
     const int dim = s->dim;
-    double *anchor = &rigid->anchor[(s->first_id + p) * (size_t)dim];
+    double *anchor = &rigid->anchor[(s->first_id + s->id[p]) * (size_t)dim];
     double slip[MPM_MAX_DIM], tangential[MPM_MAX_DIM], along = 0;
     for (int d = 0; d < dim; d++) {
         const double x = s->x[mpm_at(p, dim, d)] - rigid->offset[d];
@@ -250,7 +250,7 @@ void mpm_contact_forces(struct mpm_rigid *rigid, const struct mpm_kernels *kerne
         const double d = distance_within(rigid, s, p, rigid->def.distance, normal);
         if (!(d < rigid->def.distance)) {
             if (rigid->anchor) {
-                rigid->anchor[(s->first_id + p) * (size_t)dim] = INFINITY;
+                rigid->anchor[(s->first_id + s->id[p]) * (size_t)dim] = INFINITY;
             }
             continue;
         }
@@ -289,6 +289,7 @@ static bool put_back(struct mpm_rigid *rigid, struct mpm_particles *s, size_t p,
         *v += kick / m;
         v2 += *v * *v;
         found->mass_dx[e] += m * back;
+        found->dx_max = fmax(found->dx_max, fabs(back)); // beside what the step has moved it
         found->min[e] = fmin(found->min[e], *x);
         found->max[e] = fmax(found->max[e], *x);
         rigid->reaction[e] -= kick / dt;

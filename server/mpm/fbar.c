@@ -10,17 +10,16 @@ int mpm_fbar_scalars(enum mpm_fbar_scheme scheme) {
 }
 
 void mpm_fbar_average(struct mpm_grid *grid, const struct mpm_wall *walls, size_t n_walls,
-                      enum mpm_fbar_scheme scheme) {
-    const int scalars = mpm_fbar_scalars(scheme), stride = grid->fbar_stride;
+                      int n_threads) {
+    const size_t scalars = (size_t)grid->fbar_stride, nodes = (size_t)MPM_BLOCK_NODES(grid->dim);
+    const size_t volume = (size_t)MPM_NODE_VOLUME(grid->dim);
     mpm_walls_fold_fbar(walls, n_walls, grid);
-    MPM_FOR_ROWS(grid, first, n) {
-        for (size_t i = first; i < first + n; i++) {
-            double *node = grid->fbar + i * (size_t)stride;
-            if (node[0] > 0) {
-                for (int k = 1; k <= scalars; k++) {
-                    node[k] /= node[0];
-                }
-            }
+    (void)n_threads; // without OpenMP
+#pragma omp parallel for schedule(static) num_threads(n_threads) if (n_threads > 1)
+    for (size_t i = nodes; i < grid->n_slots * nodes; i++) {
+        const double V = grid->node[i * MPM_NODE + volume];
+        for (size_t k = 0; V > 0 && k < scalars; k++) {
+            grid->fbar[i * scalars + k] /= V;
         }
     }
     mpm_walls_mirror_fbar(walls, n_walls, grid);

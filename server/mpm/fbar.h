@@ -5,9 +5,9 @@
 
 // Sums besides V that a scheme averages: 0, 1 or 2.
 int mpm_fbar_scalars(enum mpm_fbar_scheme scheme);
-// Between scatter and finish: sums of the window become averages; a node without volume stays out.
+// Between scatter and finish: sums become averages; a node without volume stays out.
 void mpm_fbar_average(struct mpm_grid *grid, const struct mpm_wall *walls, size_t n_walls,
-                      enum mpm_fbar_scheme scheme);
+                      int n_threads);
 // max |ln(J/Jbar)| over the particles of one body: how far the volume that forces use (or, for a
 // fluid under F-bar, its raw volume ratio) has come from the ratio that stress uses. Infinite when
 // a raw ratio is not positive.

@@ -111,7 +111,7 @@ void mpm_particle_field(const struct mpm_particles *s, size_t p, enum mpm_field 
         out[0] = s->body;
         break;
     case MPM_FIELD_ID:
-        out[0] = (double)(s->first_id + p);
+        out[0] = (double)(s->first_id + s->id[p]);
         break;
     case MPM_FIELD_PLASTIC_STRAIN:
         out[0] = s->plastic_strain ? s->plastic_strain[p] : 0;
@@ -128,7 +128,7 @@ void mpm_field_copy(const struct mpm_sim *sim, enum mpm_field field, void *out) 
     for (size_t b = 0; b < sim->n_sets; b++) {
         const struct mpm_particles *s = &sim->sets[b];
         for (size_t p = 0; p < s->n; p++) {
-            const size_t id = s->first_id + p;
+            const size_t id = s->first_id + s->id[p];
             if (is_u4) {
                 double value;
                 mpm_particle_field(s, p, field, &value);

@@ -1,87 +1,178 @@
-// Memory and window of the background grid.
+// Memory of the background grid, and which of its blocks exist.
 #include "server/mpm/grid.h"
 
 #include <stdlib.h>
 #include <string.h>
 
-void mpm_grid_layout(struct mpm_grid *grid, const struct mpm_def *def) {
+#define FIRST_CAPACITY 32 // slots
+
+bool mpm_grid_layout(struct mpm_grid *grid, const struct mpm_def *def) {
     *grid = (struct mpm_grid){.dim = def->dimension, .h = def->cell, .inv_h = 1 / def->cell};
-    grid->n_nodes = 1;
-    for (int d = MPM_MAX_DIM - 1; d >= 0; d--) {
-        grid->n[d] = 1;
+    double n_nodes = 1;
+    for (int d = 0; d < MPM_MAX_DIM; d++) {
+        grid->n[d] = grid->n_blocks[d] = 1;
         if (d < def->dimension) {
             // The last node plane at or beyond the domain's end, whose edge need not be a node
             // plane.
             const double cells = (def->domain_max[d] - def->domain_min[d]) / def->cell;
+            if (!(cells < INT32_MAX / 2)) {
+                return false;
+            }
             grid->n[d] = (int)ceil(cells - 1e-9 * cells) + 1 + 2 * MPM_PAD;
+            grid->n_blocks[d] = (grid->n[d] + MPM_EDGE - 1) / MPM_EDGE;
             grid->origin[d] = def->domain_min[d] - MPM_PAD * def->cell;
+            n_nodes *= grid->n_blocks[d] * (double)MPM_EDGE;
         }
-        grid->stride[d] = grid->n_nodes;
-        grid->n_nodes *= (size_t)grid->n[d];
     }
+    return n_nodes < UINT32_MAX;
 }
 
-static size_t bytes_for(const struct mpm_grid *grid, int components) {
-    return (grid->n_nodes * (size_t)components * sizeof(double) + 63) / 64 * 64;
+static size_t n_blocks(const struct mpm_grid *g) {
+    return (size_t)g->n_blocks[0] * (size_t)g->n_blocks[1] * (size_t)g->n_blocks[2];
 }
 
-static double *take(struct mpm_grid *grid, int components) {
-    const size_t bytes = bytes_for(grid, components);
+size_t mpm_grid_bytes(const struct mpm_grid *g, uint32_t slots, int fbar_scalars) {
+    const size_t per_node = MPM_NODE + (size_t)MPM_VELOCITY(g->dim) + (size_t)fbar_scalars;
+    return n_blocks(g) * sizeof *g->slot +
+           slots * (sizeof *g->near + (size_t)MPM_BLOCK_NODES(g->dim) * per_node * sizeof(double));
+}
+
+// (capacity blocks, components) of zeros.
+static double *take(const struct mpm_grid *g, uint32_t capacity, int components) {
+    const size_t bytes =
+        capacity * (size_t)MPM_BLOCK_NODES(g->dim) * (size_t)components * sizeof(double);
     double *memory = aligned_alloc(64, bytes);
     if (memory) {
         memset(memory, 0, bytes);
-        grid->bytes += bytes;
     }
     return memory;
 }
 
+// The sums and results of a step do not outlive it, so nothing is copied.
+static bool reserve(struct mpm_grid *g, uint32_t capacity) {
+    uint32_t(*near)[8] = malloc(capacity * sizeof *near);
+    double *node = take(g, capacity, MPM_NODE);
+    double *velocity = take(g, capacity, MPM_VELOCITY(g->dim));
+    double *fbar = g->fbar_capacity > 0 ? take(g, capacity, g->fbar_capacity) : NULL;
+    if (!near || !node || !velocity || (g->fbar_capacity > 0 && !fbar)) {
+        free(near);
+        free(node);
+        free(velocity);
+        free(fbar);
+        return false;
+    }
+    free(g->near);
+    free(g->node);
+    free(g->velocity);
+    free(g->fbar);
+    g->near = near;
+    g->node = node;
+    g->velocity = velocity;
+    g->fbar = fbar;
+    g->capacity = capacity;
+    g->bytes = mpm_grid_bytes(g, capacity, g->fbar_capacity);
+    return true;
+}
+
 bool mpm_grid_create(struct mpm_grid *grid, const struct mpm_def *def) {
-    mpm_grid_layout(grid, def);
-    grid->node = take(grid, MPM_NODE(grid->dim));
-    grid->velocity = take(grid, MPM_VELOCITY(grid->dim));
-    return grid->node && grid->velocity;
+    if (!mpm_grid_layout(grid, def)) {
+        return false;
+    }
+    grid->n_slots = 1;
+    grid->slot = calloc(n_blocks(grid), sizeof *grid->slot);
+    grid->block_capacity = FIRST_CAPACITY;
+    grid->block = calloc(grid->block_capacity, sizeof *grid->block);
+    return grid->slot && grid->block;
 }
 
 bool mpm_grid_add_fbar(struct mpm_grid *grid, int scalars) {
-    if (grid->fbar_capacity >= 1 + scalars) {
+    if (grid->fbar_capacity >= scalars) {
         return true;
     }
-    double *fbar = take(grid, 1 + scalars);
-    if (!fbar) {
+    double *fbar = grid->capacity > 0 ? take(grid, grid->capacity, scalars) : NULL;
+    if (grid->capacity > 0 && !fbar) {
         return false;
     }
-    if (grid->fbar) { // the wider array takes its place
-        free(grid->fbar);
-        grid->bytes -= bytes_for(grid, grid->fbar_capacity);
-    }
+    free(grid->fbar); // the wider array takes its place
     grid->fbar = fbar;
-    grid->fbar_capacity = 1 + scalars;
+    grid->fbar_capacity = scalars;
+    grid->bytes = mpm_grid_bytes(grid, grid->capacity, scalars);
     return true;
 }
 
 void mpm_grid_free(struct mpm_grid *grid) {
+    free(grid->slot);
+    free(grid->block);
+    free(grid->near);
     free(grid->node);
     free(grid->velocity);
     free(grid->fbar);
     *grid = (struct mpm_grid){0};
 }
 
-void mpm_grid_set_window(struct mpm_grid *grid, const double *min, const double *max) {
-    for (int d = 0; d < grid->dim; d++) {
-        // The widest basis reaches one node below a particle's cell and two above it.
-        const int lo = (int)((min[d] - grid->origin[d]) * grid->inv_h) - 1;
-        const int hi = (int)((max[d] - grid->origin[d]) * grid->inv_h) + 3;
-        grid->lo[d] = lo > 0 ? lo : 0;
-        grid->hi[d] = hi < grid->n[d] ? hi : grid->n[d];
+void mpm_grid_deactivate(struct mpm_grid *grid) {
+    for (uint32_t s = 1; s < grid->n_slots; s++) {
+        grid->slot[grid->block[s]] = 0;
+    }
+    grid->n_slots = 1;
+}
+
+static uint32_t block_at(const struct mpm_grid *g, const int *place) {
+    uint32_t block = 0;
+    for (int d = 0; d < g->dim; d++) {
+        if (place[d] < 0 || place[d] >= g->n_blocks[d]) {
+            return UINT32_MAX;
+        }
+        block = block * (uint32_t)g->n_blocks[d] + (uint32_t)place[d];
+    }
+    return block;
+}
+
+bool mpm_grid_activate(struct mpm_grid *grid, const int *place) {
+    const uint32_t block = block_at(grid, place);
+    if (block == UINT32_MAX || grid->slot[block] > 0) {
+        return true;
+    }
+    if (grid->n_slots == grid->block_capacity) {
+        const uint32_t wider = 2 * grid->block_capacity;
+        uint32_t *blocks = realloc(grid->block, wider * sizeof *blocks);
+        if (!blocks) {
+            return false;
+        }
+        grid->block = blocks;
+        grid->block_capacity = wider;
+    }
+    grid->slot[block] = grid->n_slots;
+    grid->block[grid->n_slots++] = block;
+    return true;
+}
+
+void mpm_grid_block_place(const struct mpm_grid *grid, uint32_t block, int *place) {
+    for (int d = grid->dim; d-- > 0;) {
+        place[d] = (int)(block % (uint32_t)grid->n_blocks[d]);
+        block /= (uint32_t)grid->n_blocks[d];
     }
 }
 
-void mpm_grid_clear(struct mpm_grid *grid, bool fbar) {
-    const size_t width = (size_t)MPM_NODE(grid->dim), fbar_width = (size_t)grid->fbar_stride;
-    MPM_FOR_ROWS(grid, first, n) {
-        memset(grid->node + first * width, 0, n * width * sizeof(double));
-        if (fbar) {
-            memset(grid->fbar + first * fbar_width, 0, n * fbar_width * sizeof(double));
+bool mpm_grid_connect(struct mpm_grid *grid) {
+    // What the scene begins with exactly; what it spreads to later with room to spare.
+    const uint32_t wider = grid->capacity + grid->capacity / 4;
+    if (grid->n_slots > grid->capacity &&
+        !reserve(grid, wider > grid->n_slots ? wider : grid->n_slots)) {
+        return false;
+    }
+    const uint32_t nodes = (uint32_t)MPM_BLOCK_NODES(grid->dim);
+    memset(grid->near[0], 0, sizeof grid->near[0]);
+    for (uint32_t s = 1; s < grid->n_slots; s++) {
+        int place[MPM_MAX_DIM], other[MPM_MAX_DIM];
+        mpm_grid_block_place(grid, grid->block[s], place);
+        for (int k = 0; k < 8; k++) {
+            for (int d = 0; d < grid->dim; d++) {
+                other[d] = place[d] + (k >> (grid->dim - 1 - d) & 1);
+            }
+            const uint32_t block = k < 1 << grid->dim ? block_at(grid, other) : UINT32_MAX;
+            grid->near[s][k] = block == UINT32_MAX ? 0 : grid->slot[block] * nodes;
         }
     }
+    return true;
 }

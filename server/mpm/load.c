@@ -121,10 +121,11 @@ bool mpm_load_create(struct mpm_load *load, const struct mpm_load_def *def,
     }
     const size_t dim = (size_t)s->dim;
     load->particle = calloc(load->n + 1, sizeof *load->particle);
+    load->place = calloc(load->n + 1, sizeof *load->place);
     load->area = calloc(load->n + 1, sizeof *load->area);
     load->force = calloc(load->n * dim + 1, sizeof *load->force);
     load->x_before = calloc(load->n * dim + 1, sizeof *load->x_before);
-    if (!load->particle || !load->area || !load->force || !load->x_before) {
+    if (!load->particle || !load->place || !load->area || !load->force || !load->x_before) {
         mpm_load_free(load);
         return false;
     }
@@ -144,6 +145,7 @@ bool mpm_load_create(struct mpm_load *load, const struct mpm_load_def *def,
 
 void mpm_load_free(struct mpm_load *load) {
     free(load->particle);
+    free(load->place);
     free(load->area);
     free(load->force);
     free(load->x_before);
@@ -154,7 +156,8 @@ void mpm_load_update(struct mpm_load *load, const struct mpm_particles *s, doubl
     const struct mpm_load_def *q = &load->def;
     const double part = q->ramp > 0 ? fmin(1, since_start / q->ramp) : 1;
     for (size_t k = 0; k < load->n; k++) {
-        const size_t p = load->particle[k], dim = (size_t)s->dim;
+        const size_t p = mpm_place_of(s, load->particle[k]), dim = (size_t)s->dim;
+        load->place[k] = (uint32_t)p;
         double *f = load->force + k * dim, r[MPM_MAX_DIM] = {0};
         for (size_t d = 0; d < dim; d++) {
             load->x_before[k * dim + d] = s->x[mpm_at(p, s->dim, (int)d)];
@@ -187,7 +190,7 @@ double mpm_load_work(const struct mpm_load *load, const struct mpm_particles *s)
     for (size_t k = 0; k < load->n; k++) {
         for (size_t d = 0; d < dim; d++) {
             work += load->force[k * dim + d] *
-                    (s->x[mpm_at(load->particle[k], s->dim, (int)d)] - load->x_before[k * dim + d]);
+                    (s->x[mpm_at(load->place[k], s->dim, (int)d)] - load->x_before[k * dim + d]);
         }
     }
     return work;

@@ -6,7 +6,8 @@ struct mpm_load {
     struct mpm_load_def def;
     bool active;
     size_t n;
-    uint32_t *particle; // (n) index in the body, ascending
+    uint32_t *particle; // (n) ids in the body, ascending
+    uint32_t *place;    // (n) where they are in this step
     double *area;       // (n) m^2 that a pressure acts on; of a round one, per metre of radius now
     double *force;      // (n, dim) N, of this step
     double *x_before;   // (n, dim) m, for the work that it does

@@ -1,15 +1,16 @@
-// The list of all constitutive models. A new one is its file in material/ and two lines here.
-#include "server/mpm/material.h"
+// The list of all constitutive models, from laws.h.
+#include "server/mpm/laws.h"
 
 #include <string.h>
 
-extern const struct mpm_material mpm_material_neo_hookean, mpm_material_newtonian,
-    mpm_material_hencky_j2;
+#define X(name, keeps) extern const struct mpm_material mpm_material_##name;
+MPM_LAWS(X)
+#undef X
 
 static const struct mpm_material *const materials[] = {
-    &mpm_material_neo_hookean,
-    &mpm_material_newtonian,
-    &mpm_material_hencky_j2,
+#define X(name, keeps) [MPM_LAW_##name] = &mpm_material_##name,
+    MPM_LAWS(X)
+#undef X
 };
 
 size_t mpm_material_count(void) {
@@ -48,4 +49,12 @@ const struct mpm_parameter *mpm_material_parameter(const struct mpm_material *mo
         }
     }
     return model->parameters[k].key ? &model->parameters[k] : NULL;
+}
+
+enum mpm_law mpm_material_law(const struct mpm_material *model) {
+    int law = 0;
+    while (law < MPM_N_LAWS && materials[law] != model) {
+        law++;
+    }
+    return (enum mpm_law)law;
 }

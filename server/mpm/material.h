@@ -1,10 +1,12 @@
-// Inside of a constitutive model: one file in material/ with one descriptor, one line in
-// material.c.
+// Inside of a constitutive model: one file in material/ with its law and its descriptor, and its
+// place in laws.h. docs/design.md says how to add one.
 #pragma once
 #include <float.h>
 
 #include "server/mpm/mpm.h"
 #include "server/mpm/tensor.h"
+
+#define MPM_MAX_CONSTANTS 8 // doubles that a law may prepare from its parameters
 
 struct mpm_particles;
 
@@ -27,6 +29,9 @@ struct mpm_material {
     double (*wave_speed)(const double *parameters);
     // Largest kinematic viscosity, m^2/s, that limits dt; NULL = none.
     double (*diffusivity)(const double *parameters);
+    // What the law needs of the parameters, at most MPM_MAX_CONSTANTS doubles; once for many
+    // particles.
+    void (*prepare)(const double *parameters, void *constants);
     // Cauchy stress of particles [begin, end) from their deformation, in 2D and 3D. A model with a
     // rate part adds to what `rate_stress` left.
     void (*stress[2])(struct mpm_particles *s, size_t begin, size_t end);
@@ -49,12 +54,3 @@ struct mpm_material {
     {.key = "poisson_ratio", .unit = "1", .doc = "Poisson's ratio at rest",                        \
      .min = -1, .min_open = true, .max = 0.5, .max_open = true, .required = true}
 // clang-format on
-
-// Stamps out the 2D and 3D entry points of a kernel written once with a `const int dim`.
-#define MPM_STRESS_2D_3D(kernel)                                                                   \
-    static void kernel##_2d(struct mpm_particles *s, size_t begin, size_t end) {                   \
-        kernel(s, begin, end, 2);                                                                  \
-    }                                                                                              \
-    static void kernel##_3d(struct mpm_particles *s, size_t begin, size_t end) {                   \
-        kernel(s, begin, end, 3);                                                                  \
-    }

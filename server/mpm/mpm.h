@@ -29,8 +29,8 @@
     X(REACTION, "reaction")                                                                        \
     X(MAXIMUM, "maximum")                                                                          \
     X(MINIMUM, "minimum")                                                                          \
-    X(MEAN, "mean") X(ERROR, "error") X(ENERGY, "energy") X(MOMENTUM, "momentum")                  \
-        X(DRIFT, "drift")
+    X(MEAN, "mean") X(ERROR, "error") X(ENERGY, "energy") X(MOMENTUM, "momentum") X(DRIFT, "drif"  \
+                                                                                           "t")
 // How an error is measured: RMS over the standard deviation of the reference, over its RMS; largest
 // over largest; and RMS itself, in the field's unit.
 #define MPM_NORM_LIST(X) X(RMS, "rms") X(L2, "l2") X(MAX, "max") X(ABSOLUTE, "absolute")
@@ -39,8 +39,8 @@
     X(MODE, "mode")                                                                                \
     X(COLUMN, "column")                                                                            \
     X(LAME, "lame")                                                                                \
-    X(CYLINDER, "cylinder") X(TUBE, "tube") X(VORTEX, "vortex") X(TAYLOR_GREEN, "taylor_green")    \
-        X(RITTER, "ritter")
+    X(CYLINDER, "cylinder")                                                                        \
+    X(TUBE, "tube") X(VORTEX, "vortex") X(TAYLOR_GREEN, "taylor_green") X(RITTER, "ritter")
 
 enum mpm_basis {
 #define X(code, text) MPM_##code,
@@ -440,7 +440,9 @@ struct mpm_balance {
 void mpm_balance(const struct mpm_sim *sim, struct mpm_balance *out);
 
 // Seconds by phase since creation (all 0 without a clock); names are static.
-#define MPM_PHASE_LIST(X) X(P2G, "p2g") X(GRID, "grid") X(G2P, "g2p") X(FBAR, "fbar")
+#define MPM_PHASE_LIST(X)                                                                          \
+    X(SORT, "sort")                                                                                \
+    X(P2G, "p2g") X(CONTACT, "contact") X(GRID, "grid") X(G2P, "g2p") X(FBAR, "fbar")
 enum mpm_phase {
 #define X(code, text) MPM_PHASE_##code,
     MPM_PHASE_LIST(X)

@@ -6,15 +6,18 @@
 
 #define ALIGNMENT 64 // one cache line, one AVX-512 register
 
-// One walk over all fields serves counting (base NULL) and carving.
-static size_t carve(struct mpm_particles *s, char *base, bool wants_x0, bool wants_J_raw) {
+#define N_ARRAYS 11
+
+struct array {
+    double **field;
+    int components; // 0: the body does without it
+};
+
+static void list(struct mpm_particles *s, unsigned wanted, struct array *arrays) {
     const int dim = s->dim;
     const enum mpm_kinematics kept = s->material->kinematics;
     const bool fluid = kept == MPM_KEEPS_J;
-    const struct {
-        double **field;
-        int components;
-    } fields[] = {
+    const struct array all[N_ARRAYS] = {
         {&s->x, dim},
         {&s->v, dim},
         {&s->V0, 1},
@@ -24,17 +27,42 @@ static size_t carve(struct mpm_particles *s, char *base, bool wants_x0, bool wan
         {&s->b, kept == MPM_KEEPS_B ? MPM_SYM(dim) : 0},
         {&s->plastic_strain, s->material->plastic ? 1 : 0},
         {&s->Jbar, fluid ? 1 : 0},
-        {&s->x0, wants_x0 ? dim : 0},
-        {&s->J_raw, fluid && wants_J_raw ? 1 : 0},
+        {&s->x0, wanted & MPM_WANTS_X0 ? dim : 0},
+        {&s->J_raw, fluid && wanted & MPM_WANTS_J_RAW ? 1 : 0},
     };
+    memcpy(arrays, all, sizeof all);
+}
+
+// One walk over all fields serves counting (base NULL) and carving.
+static size_t carve(struct mpm_particles *s, char *base, unsigned wanted) {
+    struct array fields[N_ARRAYS];
+    list(s, wanted, fields);
     size_t bytes = 0;
-    for (size_t k = 0; k < sizeof fields / sizeof *fields; k++) {
+    for (size_t k = 0; k < N_ARRAYS; k++) {
         if (base) {
             *fields[k].field = fields[k].components ? (double *)(base + bytes) : NULL;
         }
         bytes += s->capacity * (size_t)fields[k].components * sizeof(double);
     }
-    return bytes;
+    uint32_t **const numbers[] = {&s->id, wanted & MPM_WANTS_PLACES ? &s->at : NULL};
+    for (size_t k = 0; k < sizeof numbers / sizeof *numbers; k++) {
+        if (base && numbers[k]) {
+            *numbers[k] = (uint32_t *)(base + bytes);
+        }
+        bytes += numbers[k] ? s->capacity * sizeof(uint32_t) : 0;
+    }
+    return (bytes + ALIGNMENT - 1) / ALIGNMENT * ALIGNMENT;
+}
+
+void mpm_particles_each(struct mpm_particles *s,
+                        void (*each)(void *context, double *field, int components), void *context) {
+    struct array fields[N_ARRAYS];
+    list(s, MPM_WANTS_X0 | MPM_WANTS_J_RAW, fields);
+    for (size_t k = 0; k < N_ARRAYS; k++) {
+        if (*fields[k].field) {
+            each(context, *fields[k].field, fields[k].components);
+        }
+    }
 }
 
 static size_t whole_blocks(size_t n) {
@@ -45,17 +73,21 @@ static size_t fbar_bytes(int dim, size_t capacity) {
     return capacity * (size_t)(dim + 1) * sizeof(double);
 }
 
-bool mpm_particles_create(struct mpm_particles *s, size_t n, bool wants_x0, bool wants_J_raw) {
+bool mpm_particles_create(struct mpm_particles *s, size_t n, unsigned wanted) {
     s->n = n;
     s->capacity = whole_blocks(n);
-    s->memory_bytes = carve(s, NULL, wants_x0, wants_J_raw);
+    s->memory_bytes = carve(s, NULL, wanted);
     s->memory = aligned_alloc(ALIGNMENT, s->memory_bytes);
     if (!s->memory) {
         return false;
     }
     memset(s->memory, 0, s->memory_bytes);
-    carve(s, s->memory, wants_x0, wants_J_raw);
+    carve(s, s->memory, wanted);
     for (size_t p = 0; p < n; p++) {
+        s->id[p] = (uint32_t)p;
+        if (s->at) {
+            s->at[p] = (uint32_t)p;
+        }
         if (s->F) {
             for (int d = 0; d < s->dim; d++) {
                 s->F[mpm_at(p, s->dim * s->dim, d * s->dim + d)] = 1;
@@ -96,8 +128,8 @@ void mpm_particles_free(struct mpm_particles *s) {
     *s = (struct mpm_particles){0};
 }
 
-size_t mpm_particles_bytes(const struct mpm_material *material, int dim, size_t n, bool wants_x0,
-                           bool wants_J_raw, bool fbar) {
+size_t mpm_particles_bytes(const struct mpm_material *material, int dim, size_t n, unsigned wanted,
+                           bool fbar) {
     struct mpm_particles s = {.material = material, .dim = dim, .capacity = whole_blocks(n)};
-    return carve(&s, NULL, wants_x0, wants_J_raw) + (fbar ? fbar_bytes(dim, s.capacity) : 0);
+    return carve(&s, NULL, wanted) + (fbar ? fbar_bytes(dim, s.capacity) : 0);
 }

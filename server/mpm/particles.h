@@ -4,6 +4,10 @@
 // components is field[mpm_at(p, n, c)], so one component of a block is one cache line and the order
 // of memory is the same on every instruction set. No pointers inside, so a block can go to another
 // process or a GPU as it is. A field that the body does not need is NULL.
+//
+// The particles are kept in the order of the grid's cells and change places as they move
+// (server/mpm/order.h): `id` says which is where. What belongs to a particle for good (the choice
+// of a load, the anchor of friction, the place in a frame) goes by id.
 #pragma once
 #include <stddef.h>
 #include <stdint.h>
@@ -14,13 +18,16 @@
 
 struct mpm_particles {
     size_t n, capacity; // particles; rounded up to whole blocks
-    uint32_t first_id;  // id of particle 0; ids are consecutive
+    uint32_t first_id;  // of the body's particles; their ids are consecutive
     int body, dim;
     const struct mpm_material *material;
     double parameters[MPM_MAX_PARAMETERS];
     double density;          // kg/m^3, reference; a particle's mass is density * V0
     double half, inv_4_half; // uGIMP: half the particle size, in cells; 1 / (4 half)
     bool wants_fbar;         // false: the material is excepted from F-bar
+
+    uint32_t *id; // (n) less first_id; unaligned with the blocks: plain order
+    uint32_t *at; // (n) the place of each id, where something asks for it, else NULL
 
     double *x;     // (n, dim) m
     double *v;     // (n, dim) m/s
@@ -45,9 +52,10 @@ static inline size_t mpm_at(size_t p, int n_components, int c) {
 
 // The id of the particle at place p of the storage.
 static inline size_t mpm_particle_id(const struct mpm_particles *s, size_t p) {
-    return s->first_id + p;
+    return (size_t)s->first_id + s->id[p];
 }
 
+#if MPM_LANES == 1
 // Volume ratio that the stress uses at particle p: det F; sqrt(det b), since plastic flow keeps the
 // volume; or Jbar of a fluid.
 static inline double mpm_ratio_in_use(const struct mpm_particles *s, size_t p) {
@@ -67,15 +75,25 @@ static inline double mpm_ratio_in_use(const struct mpm_particles *s, size_t p) {
     }
     return mpm_det(F, s->dim);
 }
+#endif
 
 // Mean normal stress of particle p, Pa.
 double mpm_mean_stress(const struct mpm_particles *s, size_t p);
+// The place of the particle with an id (less first_id): s->at must be there.
+static inline size_t mpm_place_of(const struct mpm_particles *s, size_t id) {
+    return s->at[id];
+}
+// Optional arrays of a body.
+enum mpm_wanted { MPM_WANTS_X0 = 1, MPM_WANTS_J_RAW = 2, MPM_WANTS_PLACES = 4 };
 // Takes one block of memory for `n` particles of the material and hands out the arrays: F = 1,
-// ratios 1, everything else 0. False when memory is short.
-bool mpm_particles_create(struct mpm_particles *s, size_t n, bool wants_x0, bool wants_J_raw);
+// ratios 1, ids in order, everything else 0. False when memory is short.
+bool mpm_particles_create(struct mpm_particles *s, size_t n, unsigned wanted);
 // The arrays that F-bar needs; keeps them once taken.
 bool mpm_particles_add_fbar(struct mpm_particles *s);
 void mpm_particles_free(struct mpm_particles *s);
 // Bytes that mpm_particles_create would take, with F-bar or without.
-size_t mpm_particles_bytes(const struct mpm_material *material, int dim, size_t n, bool wants_x0,
-                           bool wants_J_raw, bool fbar);
+size_t mpm_particles_bytes(const struct mpm_material *material, int dim, size_t n, unsigned wanted,
+                           bool fbar);
+// Calls `each` with every array of doubles that moves with the particles, and its components.
+void mpm_particles_each(struct mpm_particles *s,
+                        void (*each)(void *context, double *field, int components), void *context);

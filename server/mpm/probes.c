@@ -64,7 +64,7 @@ void mpm_probes_find_particles(struct mpm_sim *sim) {
                 if (r2 < least) {
                     least = r2;
                     sim->probe_set[k] = b;
-                    sim->probe_particle[k] = p;
+                    sim->probe_particle[k] = s->id[p];
                 }
             }
         }
@@ -176,6 +176,13 @@ static double extent(struct mpm_sim *sim, const struct mpm_probe_def *q) {
     return far;
 }
 
+// A field of the particle that the probe follows.
+static void particle_field(const struct mpm_sim *sim, size_t probe, enum mpm_field field,
+                           double *out) {
+    const struct mpm_particles *s = &sim->sets[sim->probe_set[probe]];
+    mpm_particle_field(s, mpm_place_of(s, sim->probe_particle[probe]), field, out);
+}
+
 static void present_value(struct mpm_sim *sim, size_t probe, double *out) {
     const struct mpm_probe_def *q = &sim->def->probes[probe];
     struct mpm_balance balance;
@@ -188,12 +195,10 @@ static void present_value(struct mpm_sim *sim, size_t probe, double *out) {
             fold_field(sim, probe, out);
             break;
         }
-        mpm_particle_field(&sim->sets[sim->probe_set[probe]], sim->probe_particle[probe],
-                           MPM_FIELD_DISPLACEMENT, out);
+        particle_field(sim, probe, MPM_FIELD_DISPLACEMENT, out);
         break;
     case MPM_PROBE_FIELD:
-        mpm_particle_field(&sim->sets[sim->probe_set[probe]], sim->probe_particle[probe],
-                           (enum mpm_field)q->field, out);
+        particle_field(sim, probe, (enum mpm_field)q->field, out);
         break;
     case MPM_PROBE_REACTION:
         memcpy(out, q->wall >= 0 ? sim->walls[q->wall].reaction : sim->rigids[q->rigid].reaction,

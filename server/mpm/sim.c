@@ -203,6 +203,7 @@ void mpm_enter_stage(struct mpm_sim *sim, size_t stage) {
     c->kinetic_max = 0;
     c->now = mpm_stage_settings(def, stage, &c->base);
     for (size_t k = 0; s->removes_wall && k < sim->n_walls; k++) {
+        sim->c.is_sorted &= !s->removes_wall[k]; // the walls' nodes are found with the order
         sim->walls[k].active &= !s->removes_wall[k];
         if (s->removes_wall[k]) {
             memset(sim->walls[k].reaction, 0, sizeof sim->walls[k].reaction);
@@ -278,6 +279,20 @@ static bool wants_J_raw(const struct mpm_def *def) {
     return wanted;
 }
 
+static bool wants_places(const struct mpm_def *def) {
+    bool follows = def->n_loads > 0;
+    for (size_t k = 0; k < def->n_probes; k++) {
+        const struct mpm_probe_def *probe = &def->probes[k];
+        follows |= probe->kind == MPM_PROBE_FIELD || probe->kind == MPM_PROBE_DISPLACEMENT;
+    }
+    return follows;
+}
+
+static unsigned wanted(const struct mpm_def *def) {
+    return (wants_x0(def) ? MPM_WANTS_X0 : 0) | (wants_J_raw(def) ? MPM_WANTS_J_RAW : 0) |
+           (wants_places(def) ? MPM_WANTS_PLACES : 0);
+}
+
 static bool wants_reaction(const struct mpm_def *def, size_t wall) {
     for (size_t k = 0; k < def->n_probes; k++) {
         if (def->probes[k].kind == MPM_PROBE_REACTION && def->probes[k].wall == (int)wall) {
@@ -315,14 +330,12 @@ static bool create_sets(struct mpm_sim *sim) {
                                     .wants_fbar = m->fbar};
         memcpy(s->parameters, m->parameters, sizeof s->parameters);
         const size_t n = mpm_seed(def, body, NULL, NULL);
-        if (!mpm_particles_create(s, n, wants_x0(def), wants_J_raw(def))) {
+        if (!mpm_particles_create(s, n, wanted(def))) {
             return false;
         }
         struct filling f = {.sim = sim, .s = s, .body = body};
         mpm_seed(def, body, place, &f);
         sim->n_particles += n;
-        const size_t chunks = (n + MPM_CHUNK - 1) / MPM_CHUNK;
-        sim->n_results = chunks > sim->n_results ? chunks : sim->n_results;
     }
     return true;
 }
@@ -416,9 +429,10 @@ enum mpm_status mpm_create(const struct mpm_def *def, struct mpm_sim **out, stru
         return mpm_fail(err, MPM_ERR_MEMORY, "", "no memory for the simulation");
     }
     sim->def = def;
-    sim->kernels = mpm_kernels(def->dimension, def->basis);
+    sim->kernels = mpm_kernels_plain(def->dimension, def->basis);
     sim->n_sets = def->n_bodies;
     sim->sets = calloc(def->n_bodies, sizeof *sim->sets);
+    sim->orders = calloc(def->n_bodies, sizeof *sim->orders);
     sim->walls = calloc(def->n_walls + 1, sizeof *sim->walls);
     sim->loads = calloc(def->n_loads + 1, sizeof *sim->loads);
     sim->rigids = calloc(def->n_rigids + 1, sizeof *sim->rigids);
@@ -426,15 +440,13 @@ enum mpm_status mpm_create(const struct mpm_def *def, struct mpm_sim **out, stru
         sim->c.min[d] = INFINITY;
         sim->c.max[d] = -INFINITY;
     }
-    if (!sim->sets || !sim->walls || !sim->loads || !sim->rigids ||
+    if (!sim->sets || !sim->orders || !sim->walls || !sim->loads || !sim->rigids ||
         !mpm_grid_create(&sim->grid, def) || !create_sets(sim)) {
         goto fail;
     }
     for (; sim->n_walls < def->n_walls; sim->n_walls++) {
-        if (!mpm_wall_create(&sim->walls[sim->n_walls], &def->walls[sim->n_walls], &sim->grid,
-                             def->basis, wants_reaction(def, sim->n_walls))) {
-            goto fail;
-        }
+        mpm_wall_create(&sim->walls[sim->n_walls], &def->walls[sim->n_walls], &sim->grid,
+                        def->basis, wants_reaction(def, sim->n_walls));
     }
     for (; sim->n_rigids < def->n_rigids; sim->n_rigids++) {
         if (!mpm_rigid_create(&sim->rigids[sim->n_rigids], &def->rigids[sim->n_rigids],
@@ -458,9 +470,12 @@ enum mpm_status mpm_create(const struct mpm_def *def, struct mpm_sim **out, stru
         }
     }
     set_exit(sim);
-    sim->results = calloc(sim->n_results, sizeof *sim->results);
-    if (!sim->results || !create_probes(sim) || !create_body_forces(sim) ||
-        !mpm_provide_fbar(sim, widest_fbar(def))) {
+    size_t largest = 0;
+    for (size_t b = 0; b < sim->n_sets; b++) {
+        largest = sim->sets[b].n > largest ? sim->sets[b].n : largest;
+    }
+    if (!mpm_sorter_create(&sim->sorter, largest, def->n_threads) || !create_probes(sim) ||
+        !create_body_forces(sim) || !mpm_provide_fbar(sim, widest_fbar(def))) {
         goto fail;
     }
     sim->c.base = def->settings;
@@ -471,11 +486,14 @@ enum mpm_status mpm_create(const struct mpm_def *def, struct mpm_sim **out, stru
     for (size_t b = 0; b < sim->n_sets; b++) {
         update_stress(&sim->sets[b]);
     }
+    if (!mpm_sort(sim)) {
+        goto fail;
+    }
     *out = sim;
     return MPM_OK;
 fail:
-    mpm_fail(err, MPM_ERR_MEMORY, "", "no memory for the particles and %zu nodes",
-             sim->grid.n_nodes);
+    mpm_fail(err, MPM_ERR_MEMORY, "", "no memory for %zu particles and their grid",
+             sim->n_particles);
     mpm_free(sim);
     return MPM_ERR_MEMORY;
 }
@@ -487,6 +505,10 @@ void mpm_free(struct mpm_sim *sim) {
     for (size_t b = 0; sim->sets && b < sim->n_sets; b++) {
         mpm_particles_free(&sim->sets[b]);
     }
+    for (size_t b = 0; sim->orders && b < sim->n_sets; b++) {
+        mpm_order_free(&sim->orders[b]);
+    }
+    mpm_sorter_free(&sim->sorter);
     for (size_t k = 0; sim->walls && k < sim->n_walls; k++) {
         mpm_wall_free(&sim->walls[k]);
     }
@@ -506,6 +528,7 @@ void mpm_free(struct mpm_sim *sim) {
     free(sim->compares);
     free(sim->body_forces);
     free(sim->sets);
+    free(sim->orders);
     free(sim->walls);
     free(sim->loads);
     free(sim->rigids);
@@ -517,46 +540,61 @@ void mpm_free(struct mpm_sim *sim) {
     free(sim);
 }
 
-// Bytes of a simulation of n[b] particles in body b.
-static size_t bytes_of(const struct mpm_def *def, const struct mpm_grid *grid, const size_t *n) {
-    const bool fbar = widest_fbar(def) != MPM_FBAR_OFF;
-    const int scalars = mpm_fbar_scalars(widest_fbar(def));
-    const int per_node =
-        MPM_NODE(def->dimension) + MPM_VELOCITY(def->dimension) + (fbar ? 1 + scalars : 0);
-    size_t bytes = grid->n_nodes * (size_t)per_node * sizeof(double), n_particles = 0;
-    for (size_t b = 0; b < def->n_bodies; b++) {
-        n_particles += n[b];
-        const struct mpm_material_def *m = &def->materials[def->bodies[b].material];
-        bytes += mpm_particles_bytes(m->model, def->dimension, n[b], wants_x0(def),
-                                     wants_J_raw(def), fbar && m->fbar);
-    }
-    for (size_t k = 0; k < def->n_rigids; k++) {
-        bytes += mpm_rigid_bytes(&def->rigids[k], def->dimension, n_particles);
-    }
-    for (size_t k = 0; k < def->n_probes; k++) {
-        bytes += mpm_compare_bytes(&def->probes[k], def->dimension, n_particles);
-    }
-    if (def->body_force.kind != MPM_BODY_FORCE_NONE) {
-        bytes += mpm_body_force_bytes(def->dimension, n_particles);
-    }
-    return bytes;
+struct counting {
+    const struct mpm_def *def;
+    struct mpm_grid grid; // of which only the slots are used
+    double half;
+    bool out_of_memory;
+};
+
+static bool count_blocks(void *context, const double *x, double volume) {
+    struct counting *c = context;
+    (void)volume;
+    c->out_of_memory |= !mpm_activate_around(&c->grid, c->def->basis, x, c->half);
+    return !c->out_of_memory;
 }
 
 void mpm_estimate(const struct mpm_def *def, struct mpm_estimate *out) {
     *out = (struct mpm_estimate){0};
-    struct mpm_grid grid;
-    mpm_grid_layout(&grid, def);
-    out->nodes = grid.n_nodes;
-    size_t *n = calloc(def->n_bodies + 1, sizeof *n);
-    if (!n) {
+    struct counting c = {.def = def};
+    if (!mpm_grid_create(&c.grid, def)) {
+        mpm_grid_free(&c.grid);
+        out->bytes = SIZE_MAX;
         return;
     }
+    const bool fbar = widest_fbar(def) != MPM_FBAR_OFF;
+    size_t largest = 0;
     for (size_t b = 0; b < def->n_bodies; b++) {
-        n[b] = mpm_seed(def, &def->bodies[b], NULL, NULL);
-        out->particles += n[b];
+        const struct mpm_material_def *m = &def->materials[def->bodies[b].material];
+        c.half = mpm_seed_half(&def->bodies[b]);
+        const size_t n = mpm_seed(def, &def->bodies[b], count_blocks, &c);
+        out->particles += n;
+        largest = n > largest ? n : largest;
+        out->bytes +=
+            mpm_particles_bytes(m->model, def->dimension, n, wanted(def), fbar && m->fbar);
     }
-    out->bytes = bytes_of(def, &grid, n);
-    free(n);
+    struct mpm_wall *walls = calloc(def->n_walls + 1, sizeof *walls);
+    for (size_t k = 0; walls && k < def->n_walls; k++) {
+        mpm_wall_create(&walls[k], &def->walls[k], &c.grid, def->basis, false);
+    }
+    c.out_of_memory |= !walls || !mpm_walls_activate(walls, def->n_walls, &c.grid);
+    free(walls);
+    out->nodes = (size_t)(c.grid.n_slots - 1) * (size_t)MPM_BLOCK_NODES(def->dimension);
+    out->bytes += mpm_grid_bytes(&c.grid, c.grid.n_slots, mpm_fbar_scalars(widest_fbar(def))) +
+                  mpm_sorter_bytes(largest, def->n_threads);
+    for (size_t k = 0; k < def->n_rigids; k++) {
+        out->bytes += mpm_rigid_bytes(&def->rigids[k], def->dimension, out->particles);
+    }
+    for (size_t k = 0; k < def->n_probes; k++) {
+        out->bytes += mpm_compare_bytes(&def->probes[k], def->dimension, out->particles);
+    }
+    if (def->body_force.kind != MPM_BODY_FORCE_NONE) {
+        out->bytes += mpm_body_force_bytes(def->dimension, out->particles);
+    }
+    if (c.out_of_memory) {
+        out->bytes = SIZE_MAX;
+    }
+    mpm_grid_free(&c.grid);
     double steps = 0;
     for (size_t k = 0; k < def->n_stages; k++) {
         const struct mpm_settings now = mpm_stage_settings(def, k, &def->settings);
@@ -599,11 +637,11 @@ size_t mpm_n_particles(const struct mpm_sim *sim) {
 }
 
 size_t mpm_n_nodes(const struct mpm_sim *sim) {
-    return sim->grid.n_nodes;
+    return (size_t)(sim->grid.n_slots - 1) * (size_t)MPM_BLOCK_NODES(sim->grid.dim);
 }
 
 size_t mpm_bytes(const struct mpm_sim *sim) {
-    size_t bytes = sim->grid.bytes;
+    size_t bytes = sim->grid.bytes + sim->sorter.bytes;
     for (size_t b = 0; b < sim->n_sets; b++) {
         bytes += sim->sets[b].memory_bytes + sim->sets[b].fbar_bytes;
     }

@@ -6,9 +6,9 @@
 #include "server/mpm/contact.h"
 #include "server/mpm/fbar.h"
 #include "server/mpm/load.h"
+#include "server/mpm/order.h"
 #include "server/mpm/transfer.h"
 
-#define MPM_CHUNK 1024 // particles of one unit of parallel work; never depends on the thread count
 #define MPM_AVERAGE_SLOTS 64 // points of a probe's running integral kept over its averaging window
 
 // Running integral of a probe's value over time, for its moving mean.
@@ -34,6 +34,10 @@ struct mpm_clockwork {
     double external_work;                      // J
     double min[MPM_MAX_DIM], max[MPM_MAX_DIM]; // m, bounding box of the particles
     double v2_max;                             // (m/s)^2
+    // How stale the order of the particles is: 0 = it must be made anew.
+    uint64_t is_sorted, steps_since_sort;
+    double drift;                // cells, that a particle can have moved since
+    uint64_t runs_at_sort, runs; // particles of one cell in a row: after the sort, and now
 };
 
 struct mpm_sim {
@@ -43,12 +47,14 @@ struct mpm_sim {
     double exit_min[MPM_MAX_DIM], exit_max[MPM_MAX_DIM]; // m: a particle beyond them has left
     size_t n_sets, n_walls, n_loads, n_rigids, n_particles, n_results;
     struct mpm_particles *sets; // one a body
+    struct mpm_order *orders;   // one a body
+    struct mpm_sorter sorter;
     struct mpm_wall *walls;
     struct mpm_load *loads;
     struct mpm_rigid *rigids;
-    struct mpm_span_result *results; // one a chunk of the largest body
+    struct mpm_span_result *results; // one a tile of the body with the most
     struct mpm_average *averages;    // (n_probes), NULL where no probe averages
-    size_t *probe_particle;          // (n_probes) set and particle of a probe at a point
+    size_t *probe_particle;          // (n_probes) set and id of the particle of a probe at a point
     size_t *probe_set;
     struct mpm_compare *compares;       // (n_probes)
     struct mpm_body_force *body_forces; // (n_sets), NULL without a body force
@@ -81,6 +87,11 @@ void mpm_enter_stage(struct mpm_sim *sim, size_t stage);
 double mpm_kinetic_energy(const struct mpm_sim *sim);
 // The parameters that the stages up to the present one have set: after a state was loaded.
 void mpm_restore_stage(struct mpm_sim *sim);
+// Sorts the particles by cell, and finds the blocks of the grid that they can reach and the walls'
+// nodes among these. False when memory is short.
+bool mpm_sort(struct mpm_sim *sim);
+// The same, but for the sorting, from the tiles that a saved state brought.
+bool mpm_restore_order(struct mpm_sim *sim);
 // Takes the memory that a scheme needs; what is taken stays. False when memory is short.
 bool mpm_provide_fbar(struct mpm_sim *sim, enum mpm_fbar_scheme scheme);
 // One field at one particle, as doubles (components).

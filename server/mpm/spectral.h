@@ -1,155 +1,146 @@
-// Logarithm and exponential of symmetric tensors, in the storage of tensor.h: 4 components in 2D
-// (the out-of-plane one stands alone), 6 in 3D. Right for repeated and for extreme eigenvalues.
+// Logarithm and exponential of symmetric tensors in lanes, in the storage of tensor.h: 4 components
+// in 2D (the out-of-plane one stands alone), 6 in 3D. Right for repeated and for extreme
+// eigenvalues: series near the identity, and one by one by eigenvalues elsewhere.
+//
+// A series in a tensor A needs no eigenvalues and few products: A^3 = I1 A^2 - I2 A + I3 1 (Cayley,
+// Hamilton) keeps every polynomial in the form p0 1 + p1 A + p2 A^2.
 #pragma once
 #include "server/mpm/tensor.h"
 
 // ln(b)/2 of a positive definite b: the Hencky strain of b = F F^T.
-MPM_KERNEL void mpm_half_log(const double *b, double *e, const int dim);
+MPM_KERNEL void mpm_half_log(const mpm_vec *b, mpm_vec *e, const int dim);
 // exp(2 e), its inverse.
-MPM_KERNEL void mpm_exp_twice(const double *e, double *b, const int dim);
+MPM_KERNEL void mpm_exp_twice(const mpm_vec *e, mpm_vec *b, const int dim);
 
-// Symmetric 3 x 3 product of two commuting tensors.
-MPM_KERNEL void mpm_commuting_product(const double *a, const double *b, double *c) {
-    c[0] = a[0] * b[0] + a[3] * b[3] + a[5] * b[5];
-    c[1] = a[3] * b[3] + a[1] * b[1] + a[4] * b[4];
-    c[2] = a[5] * b[5] + a[4] * b[4] + a[2] * b[2];
-    c[3] = a[0] * b[3] + a[3] * b[1] + a[5] * b[4];
-    c[4] = a[3] * b[5] + a[1] * b[4] + a[4] * b[2];
-    c[5] = a[0] * b[5] + a[3] * b[4] + a[5] * b[2];
-}
+// The same by eigenvalues, for any size, of those of n_lanes tensors whose bit is set in `lanes`:
+// component k of tensor i is b[k * n_lanes + i].
+void mpm_half_log_far(const double *b, double *e, int dim, int n_lanes, unsigned lanes);
+void mpm_exp_twice_far(const double *e, double *b, int dim, int n_lanes, unsigned lanes);
 
-// Eigenvalues w and eigenvectors (columns of the row-major Q) by cyclic Jacobi rotations.
-static inline void mpm_eigen_sym3(const double *s, double *w, double *Q) {
-    double A[9] = {s[0], s[3], s[5], s[3], s[1], s[4], s[5], s[4], s[2]};
-    for (int k = 0; k < 9; k++) {
-        Q[k] = k % 4 == 0;
-    }
-    for (int sweep = 0; sweep < 50; sweep++) { // converges quadratically: 6 or 7 in practice
-        int rotated = 0;
-        for (int p = 0; p < 2; p++) {
-            for (int q = p + 1; q < 3; q++) {
-                const double a = A[3 * p + q];
-                // Off-diagonals below round-off of both diagonals: keeps small eigenvalues
-                // relative.
-                if (fabs(a) <= 1e-17 * sqrt(fabs(A[4 * p] * A[4 * q]))) {
-                    continue;
-                }
-                rotated = 1;
-                const double theta = (A[4 * q] - A[4 * p]) / (2 * a);
-                const double t = copysign(1, theta) / (fabs(theta) + sqrt(theta * theta + 1));
-                const double c = 1 / sqrt(t * t + 1), n = t * c;
-                A[4 * p] -= t * a;
-                A[4 * q] += t * a;
-                A[3 * p + q] = A[3 * q + p] = 0;
-                const int r = 3 - p - q;
-                const double arp = A[3 * r + p], arq = A[3 * r + q];
-                A[3 * r + p] = A[3 * p + r] = c * arp - n * arq;
-                A[3 * r + q] = A[3 * q + r] = n * arp + c * arq;
-                for (int k = 0; k < 3; k++) {
-                    const double kp = Q[3 * k + p], kq = Q[3 * k + q];
-                    Q[3 * k + p] = c * kp - n * kq;
-                    Q[3 * k + q] = n * kp + c * kq;
-                }
-            }
+// The tensor with eigenvalues w along the columns of the row-major Q, in 3D.
+void mpm_from_eigen(const double *w, const double *Q, double *s);
+
+// The series reach to this Frobenius norm of their argument.
+#define MPM_SERIES_REACH 0.2
+
+// Replaces the lanes of y that are out of a series' reach.
+MPM_KERNEL void mpm_far_lanes(void (*far)(const double *, double *, int, int, unsigned),
+                              mpm_mask near, const mpm_vec *x, mpm_vec *y, const int dim) {
+    const unsigned lanes = mpm_bits(mpm_not(near));
+    if (MPM_UNLIKELY(lanes)) {
+        double from[6 * MPM_LANES], to[6 * MPM_LANES];
+        for (int k = 0; k < MPM_SYM(dim); k++) {
+            mpm_store(from + k * MPM_LANES, x[k]);
+            mpm_store(to + k * MPM_LANES, y[k]);
         }
-        if (!rotated) {
-            break;
-        }
-    }
-    for (int k = 0; k < 3; k++) {
-        w[k] = A[4 * k];
-    }
-}
-
-MPM_KERNEL void mpm_from_eigen(const double *w, const double *Q, double *s) {
-    for (int k = 0; k < 6; k++) {
-        const int i = mpm_sym_row(k), j = mpm_sym_column(k);
-        s[k] = 0;
-        for (int d = 0; d < 3; d++) {
-            s[k] += w[d] * Q[3 * i + d] * Q[3 * j + d];
+        far(from, to, dim, MPM_LANES, lanes);
+        for (int k = 0; k < MPM_SYM(dim); k++) {
+            y[k] = mpm_load(to + k * MPM_LANES);
         }
     }
 }
 
-// 3D near the identity: ln(b)/2 = atanh(X) with X = (b - 1)(b + 1)^-1, as its series to X^9; the
-// first term left out is below round-off of the first while |X| is below this.
-#define MPM_SERIES_REACH 0.02
-
-// atanh(r/m)/r for 0 <= r < m, with its limit 1/m; log_det = ln(m^2 - r^2) is better known than m -
-// r where the eigenvalues lie far apart.
-MPM_KERNEL double mpm_atanh_ratio(const double r, const double m, const double log_det) {
-    const double q = r / m;
-    return q < 1e-4 ? (1 + q * q / 3) / m : q < 0.5 ? atanh(q) / r : (log(m + r) - log_det / 2) / r;
+// Product of two tensors that commute.
+MPM_KERNEL void mpm_commuting_product(const mpm_vec *a, const mpm_vec *b, mpm_vec *c,
+                                      const int dim) {
+    c[0] = a[0] * b[0] + a[3] * b[3];
+    c[1] = a[3] * b[3] + a[1] * b[1];
+    c[2] = a[2] * b[2];
+    c[3] = a[0] * b[3] + a[3] * b[1];
+    if (dim == 3) {
+        c[0] += a[5] * b[5];
+        c[1] += a[4] * b[4];
+        c[2] += a[5] * b[5] + a[4] * b[4];
+        c[3] += a[5] * b[4];
+        c[4] = a[3] * b[5] + a[1] * b[4] + a[4] * b[2];
+        c[5] = a[0] * b[5] + a[3] * b[4] + a[5] * b[2];
+    }
 }
 
-MPM_KERNEL void mpm_half_log(const double *b, double *e, const int dim) {
-    if (dim == 2) {
-        // ln b = ln(det)/2 1 + atanh(r/m)/r (b - m 1), with eigenvalues m +- r
-        const double m = 0.5 * (b[0] + b[1]), half = 0.5 * (b[0] - b[1]);
-        const double r = sqrt(half * half + b[3] * b[3]);
-        const double det = b[0] * b[1] - b[3] * b[3];
-        const double log_det = log(det), mean = 0.25 * log_det;
-        const double f = 0.5 * mpm_atanh_ratio(r, m, log_det);
-        e[0] = mean + f * half;
-        e[1] = mean - f * half;
-        e[2] = 0.5 * log(b[2]);
-        e[3] = f * b[3];
-        return;
-    }
-    double B[6], size = 0;
-    for (int k = 0; k < 6; k++) {
-        B[k] = b[k] - (k < 3);
-        size += fabs(B[k]);
-    }
-    if (size < 2 * MPM_SERIES_REACH) {
-        // (b + 1)^-1 by cofactors
-        const double a0 = b[0] + 1, a1 = b[1] + 1, a2 = b[2] + 1;
-        const double c0 = a1 * a2 - b[4] * b[4], c3 = b[5] * b[4] - b[3] * a2;
-        const double c5 = b[3] * b[4] - b[5] * a1;
-        const double r = 1 / (a0 * c0 + b[3] * c3 + b[5] * c5);
-        const double inverse[6] = {
-            r * c0, r * (a0 * a2 - b[5] * b[5]),   r * (a0 * a1 - b[3] * b[3]),
-            r * c3, r * (b[3] * b[5] - a0 * b[4]), r * c5};
-        double X[6], X2[6], sum[6], next[6];
-        mpm_commuting_product(B, inverse, X);
-        mpm_commuting_product(X, X, X2);
-        for (int k = 0; k < 6; k++) { // Horner in X^2: 1/9, 1/7, 1/5, 1/3, 1
-            sum[k] = X2[k] / 9 + (k < 3 ? 1.0 / 7 : 0);
+// p0 1 + p1 A + p2 A^2
+MPM_KERNEL void mpm_quadratic(mpm_vec p0, mpm_vec p1, mpm_vec p2, const mpm_vec *A,
+                              const mpm_vec *A2, mpm_vec *out, const int dim) {
+    for (int k = 0; k < MPM_SYM(dim); k++) {
+        out[k] = p1 * A[k] + p2 * A2[k];
+        if (k < 3) {
+            out[k] += p0;
         }
-        for (int n = 5; n >= 1; n -= 2) {
-            mpm_commuting_product(X2, sum, next);
-            for (int k = 0; k < 6; k++) {
-                sum[k] = next[k] + (k < 3 ? 1.0 / n : 0);
-            }
-        }
-        mpm_commuting_product(X, sum, e);
-        return;
     }
-    double w[3], Q[9];
-    mpm_eigen_sym3(b, w, Q);
-    for (int d = 0; d < 3; d++) {
-        w[d] = 0.5 * log(w[d]);
-    }
-    mpm_from_eigen(w, Q, e);
 }
 
-MPM_KERNEL void mpm_exp_twice(const double *e, double *b, const int dim) {
-    if (dim == 2) {
-        const double m = e[0] + e[1], half = e[0] - e[1], shear = 2 * e[3]; // of 2 e
-        const double r = sqrt(half * half + shear * shear), scale = exp(m);
-        const double s = r < 1e-4 ? 1 + r * r / 6 : sinh(r) / r, c = cosh(r);
-        b[2] = exp(2 * e[2]);
-        b[3] = scale * s * shear;
-        // The smaller diagonal entry from the determinant, scale^2: c - s |half| would cancel.
-        const int large = half < 0;
-        b[large] = scale * (c + s * fabs(half));
-        b[!large] = (scale * scale + b[3] * b[3]) / b[large];
-        return;
+// ln(b)/2 = atanh(X) with X = (b - 1)(b + 1)^-1: X g(X^2) with g(y) = atanh(sqrt(y))/sqrt(y), a
+// minimax polynomial (Remez, 1.4e-17 for y <= 0.0401).
+MPM_KERNEL void mpm_half_log(const mpm_vec *b, mpm_vec *e, const int dim) {
+    static const double g[] = {1,
+                               0.3333333333333783,
+                               0.19999999997658027,
+                               0.14285714750409342,
+                               0.11111065895132118,
+                               0.09093291839488891,
+                               0.0762313428117756,
+                               0.07697570205607637};
+    mpm_vec B[6], inverse[6], X[6], Y[6];
+    for (int k = 0; k < MPM_SYM(dim); k++) {
+        B[k] = k < 3 ? b[k] - 1.0 : b[k];
     }
-    double w[3], Q[9];
-    mpm_eigen_sym3(e, w, Q);
-    for (int d = 0; d < 3; d++) {
-        w[d] = exp(2 * w[d]);
+    const mpm_vec a0 = b[0] + 1.0, a1 = b[1] + 1.0, a2 = b[2] + 1.0; // (b + 1)^-1 by cofactors
+    inverse[0] = a1 * a2;
+    inverse[1] = a0 * a2;
+    inverse[2] = a0 * a1 - b[3] * b[3];
+    inverse[3] = -b[3] * a2;
+    mpm_vec det = a2 * inverse[2];
+    if (dim == 3) {
+        inverse[0] -= b[4] * b[4];
+        inverse[1] -= b[5] * b[5];
+        inverse[3] += b[5] * b[4];
+        inverse[4] = b[3] * b[5] - a0 * b[4];
+        inverse[5] = b[3] * b[4] - b[5] * a1;
+        det += b[4] * inverse[4] + b[5] * inverse[5];
     }
-    mpm_from_eigen(w, Q, b);
+    const mpm_vec r = 1.0 / det;
+    for (int k = 0; k < MPM_SYM(dim); k++) {
+        inverse[k] *= r;
+    }
+    mpm_commuting_product(B, inverse, X, dim);
+    mpm_commuting_product(X, X, Y, dim);
+
+    // Invariants of X (J) and of Y = X^2 (I); g(Y) = p0 1 + p1 Y + p2 Y^2 by Horner's rule.
+    const mpm_vec J1 = X[0] + X[1] + X[2], J3 = mpm_det_sym(X, dim);
+    const mpm_vec I1 = Y[0] + Y[1] + Y[2], J2 = 0.5 * (J1 * J1 - I1);
+    const mpm_vec I2 = J2 * J2 - 2.0 * J1 * J3, I3 = J3 * J3;
+    mpm_vec p0 = mpm_splat(g[5]), p1 = mpm_splat(g[6]), p2 = mpm_splat(g[7]);
+    for (int k = 4; k >= 0; k--) {
+        const mpm_vec top = p2;
+        p2 = p1 + top * I1;
+        p1 = p0 - top * I2;
+        p0 = g[k] + top * I3;
+    }
+    // X g(Y) = p0 X + p1 X^3 + p2 X^5, once more with Cayley and Hamilton.
+    const mpm_vec q = p1 + p2 * (J1 * J1 - J2);
+    mpm_quadratic(J3 * q, p0 - J2 * q + p2 * (J1 * J3), J1 * q + p2 * (J3 - J1 * J2), X, Y, e, dim);
+    mpm_far_lanes(mpm_half_log_far, I1 <= MPM_SERIES_REACH * MPM_SERIES_REACH, b, e, dim);
+}
+
+// exp(2 e) = exp(trace(2 e)/3) exp(A) with the deviator A; its Taylor series to A^11 (8e-18).
+MPM_KERNEL void mpm_exp_twice(const mpm_vec *e, mpm_vec *b, const int dim) {
+    static const double c[] = {
+        1,         1,          1.0 / 2,     1.0 / 6,      1.0 / 24,      1.0 / 120,
+        1.0 / 720, 1.0 / 5040, 1.0 / 40320, 1.0 / 362880, 1.0 / 3628800, 1.0 / 39916800};
+    const mpm_vec mean = (e[0] + e[1] + e[2]) * (1.0 / 3);
+    mpm_vec A[6], A2[6];
+    for (int k = 0; k < MPM_SYM(dim); k++) {
+        A[k] = 2.0 * (k < 3 ? e[k] - mean : e[k]);
+    }
+    mpm_commuting_product(A, A, A2, dim);
+    const mpm_vec norm2 = A2[0] + A2[1] + A2[2], I2 = -0.5 * norm2, I3 = mpm_det_sym(A, dim);
+    mpm_vec p0 = mpm_splat(c[9]), p1 = mpm_splat(c[10]), p2 = mpm_splat(c[11]);
+    for (int k = 8; k >= 0; k--) {
+        const mpm_vec top = p2;
+        p2 = p1;
+        p1 = p0 - top * I2;
+        p0 = c[k] + top * I3;
+    }
+    const mpm_vec scale = mpm_exp(2.0 * mean);
+    mpm_quadratic(scale * p0, scale * p1, scale * p2, A, A2, b, dim);
+    mpm_far_lanes(mpm_exp_twice_far, norm2 <= MPM_SERIES_REACH * MPM_SERIES_REACH, e, b, dim);
 }

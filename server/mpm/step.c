@@ -12,63 +12,110 @@
 // eq. 9: nodal velocities. Damping acts on the total force, before boundary conditions; FLIP's
 // increment is taken from v^n before boundary conditions.
 MPM_KERNEL void update_nodes(struct mpm_grid *grid, const double *gravity,
-                             const struct mpm_settings *now, double dt, const int dim) {
+                             const struct mpm_settings *now, double dt, int n_threads,
+                             const int dim) {
     const double local = now->damping_local, mass = now->damping_mass;
-    MPM_FOR_ROWS(grid, first, n) {
-        for (size_t i = first; i < first + n; i++) {
-            const double *node = grid->node + i * MPM_NODE(dim);
-            double *velocity = grid->velocity + i * MPM_VELOCITY(dim);
-            const double m = node[0];
-            if (!(m > 0)) {
-                memset(velocity, 0, MPM_VELOCITY(dim) * sizeof *velocity);
-                continue;
+    (void)n_threads; // without OpenMP
+#pragma omp parallel for schedule(static) num_threads(n_threads) if (n_threads > 1)
+    for (size_t i = MPM_BLOCK_NODES(dim); i < grid->n_slots * (size_t)MPM_BLOCK_NODES(dim); i++) {
+        const double *node = grid->node + i * MPM_NODE;
+        double *velocity = grid->velocity + i * MPM_VELOCITY(dim);
+        const double m = node[0];
+        if (!(m > 0)) {
+            memset(velocity, 0, MPM_VELOCITY(dim) * sizeof *velocity);
+            continue;
+        }
+        const double r = 1 / m;
+        for (int d = 0; d < dim; d++) {
+            const double v = node[1 + d] * r;
+            double f = node[1 + dim + d] + m * gravity[d];
+            if (local != 0 && v != 0) {
+                f -= copysign(local * fabs(f), v);
             }
-            const double r = 1 / m;
-            for (int d = 0; d < dim; d++) {
-                const double v = node[1 + d] * r;
-                double f = node[1 + dim + d] + m * gravity[d];
-                if (local != 0 && v != 0) {
-                    f -= copysign(local * fabs(f), v);
-                }
-                f -= mass * node[1 + d];
-                const double dv = dt * f * r;
-                velocity[d] = v + dv;
-                velocity[dim + d] = dv;
-            }
+            f -= mass * node[1 + d];
+            const double dv = dt * f * r;
+            velocity[d] = v + dv;
+            velocity[dim + d] = dv;
         }
     }
 }
 
-// One kernel over all particles of a body, in chunks that do not depend on the number of threads;
-// what the chunks found is joined in their order.
-static void run_chunks(struct mpm_sim *sim, struct mpm_span span,
-                       void (*kernel)(const struct mpm_span *, struct mpm_span_result *),
-                       struct mpm_span_result *joined) {
-    const size_t n = span.s->n;
-    const long n_chunks = (long)((n + MPM_CHUNK - 1) / MPM_CHUNK);
-    const int n_threads = sim->def->n_threads;
+static void clear_nodes(struct mpm_grid *grid, bool fbar, int n_threads) {
+    const size_t nodes = (size_t)MPM_BLOCK_NODES(grid->dim);
+    const size_t scalars = (size_t)grid->fbar_stride;
     (void)n_threads; // without OpenMP
-#pragma omp parallel for schedule(static) num_threads(n_threads) if (n_threads > 1 && n_chunks > 1)
-    for (long k = 0; k < n_chunks; k++) {
-        struct mpm_span chunk = span;
-        chunk.begin = (size_t)k * MPM_CHUNK;
-        chunk.end = chunk.begin + MPM_CHUNK < n ? chunk.begin + MPM_CHUNK : n;
-        kernel(&chunk, &sim->results[k]);
-    }
-    for (long k = 0; k < n_chunks; k++) {
-        const struct mpm_span_result *r = &sim->results[k];
-        for (int d = 0; d < sim->grid.dim; d++) {
-            joined->min[d] = fmin(joined->min[d], r->min[d]);
-            joined->max[d] = fmax(joined->max[d], r->max[d]);
-            joined->mass_dx[d] += r->mass_dx[d];
-        }
-        joined->v2_max = r->v2_max > joined->v2_max ? r->v2_max : joined->v2_max;
-        if (joined->bad == SIZE_MAX && r->bad != SIZE_MAX) {
-            joined->bad = r->bad + span.s->first_id; // its id
-            joined->status = r->status;
-            joined->value = r->value;
+#pragma omp parallel for schedule(static) num_threads(n_threads) if (n_threads > 1)
+    for (size_t s = 0; s < grid->n_slots; s++) {
+        memset(grid->node + s * nodes * MPM_NODE, 0, nodes * MPM_NODE * sizeof(double));
+        if (fbar) {
+            memset(grid->fbar + s * nodes * scalars, 0, nodes * scalars * sizeof(double));
         }
     }
+}
+
+static void join(struct mpm_span_result *joined, const struct mpm_span_result *r,
+                 const struct mpm_particles *s) {
+    for (int d = 0; d < s->dim; d++) {
+        joined->min[d] = r->min[d] < joined->min[d] ? r->min[d] : joined->min[d];
+        joined->max[d] = r->max[d] > joined->max[d] ? r->max[d] : joined->max[d];
+        joined->mass_dx[d] += r->mass_dx[d];
+    }
+    joined->v2_max = r->v2_max > joined->v2_max ? r->v2_max : joined->v2_max;
+    joined->dx_max = r->dx_max > joined->dx_max ? r->dx_max : joined->dx_max;
+    joined->n_runs += r->n_runs;
+    if (joined->bad == SIZE_MAX && r->bad != SIZE_MAX) {
+        joined->bad = s->first_id + s->id[r->bad];
+        joined->status = r->status;
+        joined->value = r->value;
+    }
+}
+
+typedef void tile_work(const struct mpm_sim *sim, const struct mpm_span *span,
+                       struct mpm_span_result *result);
+
+// Works on all tiles of a body. What adds to the grid goes colour by colour: tiles of one colour
+// reach no common node, and those of the next wait for them, so that every node's sum has one order
+// whatever the number of threads. What the tiles found is joined in their order.
+static void for_tiles(struct mpm_sim *sim, size_t body, struct mpm_span span, bool adds,
+                      tile_work *work, struct mpm_span_result *joined) {
+    const struct mpm_order *order = &sim->orders[body];
+    const int n_threads = sim->def->n_threads, n_colours = adds ? order->n_colours : 1;
+    (void)n_threads; // without OpenMP
+    span.s = &sim->sets[body];
+    span.grid = &sim->grid;
+#pragma omp parallel num_threads(n_threads) if (n_threads > 1)
+    for (int colour = 0; colour < n_colours; colour++) {
+        const size_t begin = adds ? order->colour_begin[colour] : 0;
+        const size_t end = adds ? order->colour_begin[colour + 1] : order->n_tiles;
+#pragma omp for schedule(dynamic, 1)
+        for (size_t k = begin; k < end; k++) {
+            const size_t t = adds ? order->by_colour[k] : k;
+            struct mpm_span tile = span;
+            tile.begin = order->tile[t].begin;
+            tile.end = order->tile[t].end;
+            sim->results[t] = mpm_nothing_found();
+            work(sim, &tile, &sim->results[t]);
+        }
+    }
+    for (size_t t = 0; joined && t < order->n_tiles; t++) {
+        join(joined, &sim->results[t], span.s);
+    }
+}
+
+static void p2g(const struct mpm_sim *sim, const struct mpm_span *span, struct mpm_span_result *r) {
+    sim->kernels->p2g(span, r);
+}
+
+static void g2p(const struct mpm_sim *sim, const struct mpm_span *span, struct mpm_span_result *r) {
+    sim->kernels->g2p(span, r);
+    if (span->fbar) { // while the tile is in the cache
+        sim->kernels->fbar_scatter[sim->c.now.fbar.scheme](span);
+    }
+}
+
+static void finish(const struct mpm_sim *sim, const struct mpm_span *span,
+                   struct mpm_span_result *r) {
+    sim->kernels->fbar_finish[sim->c.now.fbar.scheme](span, r);
 }
 
 static enum mpm_status step_failure(const struct mpm_sim *sim, enum mpm_status status, double time,
@@ -104,19 +151,26 @@ static enum mpm_status step_failure(const struct mpm_sim *sim, enum mpm_status s
 // The first particle outside the domain, by id: the joined bounds say that there is one.
 static enum mpm_status left_domain(const struct mpm_sim *sim, double time, struct mpm_error *err) {
     static const char *const names[] = {"position.x", "position.y", "position.z"};
+    int64_t first = INT64_MAX;
+    int axis = 0;
+    double value = 0;
     for (size_t b = 0; b < sim->n_sets; b++) {
         const struct mpm_particles *s = &sim->sets[b];
         for (size_t p = 0; p < s->n; p++) {
             for (int d = 0; d < s->dim; d++) {
                 const double x = s->x[mpm_at(p, s->dim, d)];
-                if (!(x >= sim->exit_min[d] && x <= sim->exit_max[d])) {
-                    return step_failure(sim, MPM_ERR_LEFT_DOMAIN, time, (int64_t)(s->first_id + p),
-                                        names[d], x, err);
+                const int64_t id = s->first_id + s->id[p];
+                if (!(x >= sim->exit_min[d] && x <= sim->exit_max[d]) && id < first) {
+                    first = id;
+                    axis = d;
+                    value = x;
                 }
             }
         }
     }
-    return MPM_OK;
+    return first == INT64_MAX
+               ? MPM_OK
+               : step_failure(sim, MPM_ERR_LEFT_DOMAIN, time, first, names[axis], value, err);
 }
 
 static enum mpm_status check_result(const struct mpm_sim *sim, const struct mpm_span_result *r,
@@ -171,9 +225,13 @@ static void move_rigid_bodies(struct mpm_sim *sim, double dt, struct mpm_span_re
         for (int d = 0; d < sim->grid.dim; d++) {
             rigid->offset[d] += dt * rigid->def.velocity[d];
         }
+        struct mpm_span_result pushed = *found;
+        pushed.dx_max = 0;
         for (size_t b = 0; b < sim->n_sets; b++) {
-            mpm_contact_keep_out(rigid, &sim->sets[b], dt, found);
+            mpm_contact_keep_out(rigid, &sim->sets[b], dt, &pushed);
         }
+        pushed.dx_max += found->dx_max;
+        *found = pushed;
         for (int d = 0; d < sim->grid.dim; d++) {
             sim->c.external_work -= dt * rigid->reaction[d] * rigid->def.velocity[d];
         }
@@ -197,34 +255,36 @@ static void leave_stage_if_over(struct mpm_sim *sim) {
     }
 }
 
-enum mpm_status mpm_step(struct mpm_sim *sim, struct mpm_error *err) {
-    const struct mpm_settings *now = &sim->c.now;
-    const int dim = sim->grid.dim;
-    const double dt = mpm_next_dt(sim), time = sim->c.time + dt;
-    const double cfl = dt * (mpm_wave_speed(sim) + mpm_largest_speed(sim)) / sim->grid.h;
-    if (cfl > UNSTABLE_CFL && !sim->def->unstable_ok) {
-        return step_failure(sim, MPM_ERR_UNSTABLE_DT, time, -1, "CFL number", cfl, err);
-    }
-    double gravity[MPM_MAX_DIM];
-    mpm_gravity_at(sim, sim->c.time, gravity);
-    double clock = now_or_zero(sim);
+#define MOST_DRIFT 0.999 // cells: below 1 by more than the round-off of a position in cells
+#define MOST_RUNS 1.5    // times as many runs as after a sort: each then holds too few particles
+#define LEAST_STEPS 10   // between two sorts for speed's sake: a sort costs about three steps
 
-    // P2G, eqs. 7, 8, 10
-    const bool any_fbar = now->fbar.scheme != MPM_FBAR_OFF;
-    sim->grid.fbar_stride = 1 + mpm_fbar_scalars(now->fbar.scheme);
-    mpm_grid_set_window(&sim->grid, sim->c.min, sim->c.max);
-    mpm_walls_extend_window(sim->walls, sim->n_walls, &sim->grid);
-    mpm_grid_clear(&sim->grid, any_fbar);
+// A sort is due when a particle may have drifted out of its tile's reach, or when too many have
+// left their cell's run. That depends on the state alone, so it comes at the same steps for any
+// number of threads and after a restart.
+static bool sort_is_due(const struct mpm_clockwork *c) {
+    return !c->is_sorted || c->drift > MOST_DRIFT ||
+           (c->steps_since_sort >= LEAST_STEPS &&
+            (double)c->runs > MOST_RUNS * (double)c->runs_at_sort);
+}
+
+// eqs. 7, 8, 10, and the forces of loads and rigid bodies.
+static void particles_to_grid(struct mpm_sim *sim, double dt, bool any_fbar, double *clock) {
+    struct mpm_span_result found = mpm_nothing_found();
+    clear_nodes(&sim->grid, any_fbar, sim->def->n_threads);
     for (size_t b = 0; b < sim->n_sets; b++) {
-        sim->kernels->p2g(&(struct mpm_span){
-            .s = &sim->sets[b], .grid = &sim->grid, .begin = 0, .end = sim->sets[b].n, .dt = dt});
+        const struct mpm_span span = {.dt = dt, .fbar = any_fbar && sim->sets[b].wants_fbar};
+        for_tiles(sim, b, span, true, p2g, &found);
     }
+    sim->c.runs = found.n_runs;
+    sim->c.runs_at_sort = sim->c.steps_since_sort == 0 ? found.n_runs : sim->c.runs_at_sort;
+    charge(sim, MPM_PHASE_P2G, clock);
     for (size_t k = 0; k < sim->n_loads; k++) {
         struct mpm_load *load = &sim->loads[k];
         struct mpm_particles *s = &sim->sets[load->def.body];
         if (load->active) {
             mpm_load_update(load, s, sim->c.time - mpm_start_time(sim));
-            sim->kernels->force(&(struct mpm_span){.s = s, .grid = &sim->grid}, load->particle,
+            sim->kernels->force(&(struct mpm_span){.s = s, .grid = &sim->grid}, load->place,
                                 load->force, load->n);
         }
     }
@@ -239,50 +299,63 @@ enum mpm_status mpm_step(struct mpm_sim *sim, struct mpm_error *err) {
             mpm_contact_forces(rigid, sim->kernels, &sim->sets[b], &sim->grid, dt);
         }
     }
-    charge(sim, MPM_PHASE_P2G, &clock);
+    if (sim->n_loads + sim->n_rigids > 0) {
+        charge(sim, MPM_PHASE_CONTACT, clock);
+    }
+}
+
+enum mpm_status mpm_step(struct mpm_sim *sim, struct mpm_error *err) {
+    const struct mpm_settings *now = &sim->c.now;
+    const int dim = sim->grid.dim, n_threads = sim->def->n_threads;
+    const double dt = mpm_next_dt(sim), time = sim->c.time + dt;
+    const double cfl = dt * (mpm_wave_speed(sim) + mpm_largest_speed(sim)) / sim->grid.h;
+    if (cfl > UNSTABLE_CFL && !sim->def->unstable_ok) {
+        return step_failure(sim, MPM_ERR_UNSTABLE_DT, time, -1, "CFL number", cfl, err);
+    }
+    double gravity[MPM_MAX_DIM];
+    mpm_gravity_at(sim, sim->c.time, gravity);
+    double clock = now_or_zero(sim);
+    if (sort_is_due(&sim->c)) {
+        if (!mpm_sort(sim)) {
+            return step_failure(sim, MPM_ERR_MEMORY, time, -1, "bytes of particles and grid",
+                                (double)mpm_bytes(sim), err);
+        }
+        charge(sim, MPM_PHASE_SORT, &clock);
+    }
+
+    // P2G, eqs. 7, 8, 10
+    const enum mpm_fbar_scheme scheme = now->fbar.scheme;
+    const bool any_fbar = scheme != MPM_FBAR_OFF;
+    sim->grid.fbar_stride = mpm_fbar_scalars(scheme);
+    particles_to_grid(sim, dt, any_fbar, &clock);
 
     // Grid, eq. 9, and boundary conditions
     mpm_walls_fold(sim->walls, sim->n_walls, &sim->grid, gravity, dt);
     if (dim == 2) {
-        update_nodes(&sim->grid, gravity, now, dt, 2);
+        update_nodes(&sim->grid, gravity, now, dt, n_threads, 2);
     } else {
-        update_nodes(&sim->grid, gravity, now, dt, 3);
+        update_nodes(&sim->grid, gravity, now, dt, n_threads, 3);
     }
     mpm_walls_apply(sim->walls, sim->n_walls, &sim->grid, gravity, dt);
     charge(sim, MPM_PHASE_GRID, &clock);
 
-    // G2P, eqs. 11-17
-    struct mpm_span_result found = {.min = {INFINITY, INFINITY, INFINITY},
-                                    .max = {-INFINITY, -INFINITY, -INFINITY},
-                                    .bad = SIZE_MAX};
+    // G2P, eqs. 11-17; with F-bar, eq. 19 (Algorithm 1, step 3) with it
+    struct mpm_span_result found = mpm_nothing_found();
     for (size_t b = 0; b < sim->n_sets; b++) {
-        struct mpm_particles *s = &sim->sets[b];
-        const struct mpm_span span = {.s = s,
-                                      .grid = &sim->grid,
-                                      .dt = dt,
-                                      .blend = now->blend,
-                                      .fbar = any_fbar && s->wants_fbar};
-        run_chunks(sim, span, sim->kernels->g2p, &found);
+        const bool fbar = any_fbar && sim->sets[b].wants_fbar;
+        const struct mpm_span span = {
+            .dt = dt, .blend = now->blend, .fbar = fbar, .a = now->fbar.a, .C = now->fbar.C};
+        for_tiles(sim, b, span, fbar, g2p, &found);
     }
     charge(sim, MPM_PHASE_G2P, &clock);
 
-    // F-bar, eqs. 19-27: Algorithm 1, steps 3 to 5
+    // F-bar, eqs. 20-27: Algorithm 1, steps 4 and 5
     if (any_fbar) {
-        const enum mpm_fbar_scheme scheme = now->fbar.scheme;
+        mpm_fbar_average(&sim->grid, sim->walls, sim->n_walls, n_threads);
         for (size_t b = 0; b < sim->n_sets; b++) {
-            struct mpm_particles *s = &sim->sets[b];
-            if (s->wants_fbar) {
-                sim->kernels->fbar_scatter[scheme](&(struct mpm_span){
-                    .s = s, .grid = &sim->grid, .begin = 0, .end = s->n, .a = now->fbar.a});
-            }
-        }
-        mpm_fbar_average(&sim->grid, sim->walls, sim->n_walls, scheme);
-        for (size_t b = 0; b < sim->n_sets; b++) {
-            struct mpm_particles *s = &sim->sets[b];
-            if (s->wants_fbar) {
-                const struct mpm_span span = {
-                    .s = s, .grid = &sim->grid, .fbar = true, .C = now->fbar.C};
-                run_chunks(sim, span, sim->kernels->fbar_finish[scheme], &found);
+            if (sim->sets[b].wants_fbar) {
+                const struct mpm_span span = {.fbar = true, .C = now->fbar.C};
+                for_tiles(sim, b, span, false, finish, &found);
             }
         }
         charge(sim, MPM_PHASE_FBAR, &clock);
@@ -292,6 +365,7 @@ enum mpm_status mpm_step(struct mpm_sim *sim, struct mpm_error *err) {
     if (!status && sim->n_rigids > 0) {
         move_rigid_bodies(sim, dt, &found);
         status = check_result(sim, &found, time, err); // none was pushed out of the domain
+        charge(sim, MPM_PHASE_CONTACT, &clock);
     }
     if (status) {
         return status;
@@ -316,6 +390,8 @@ enum mpm_status mpm_step(struct mpm_sim *sim, struct mpm_error *err) {
         sim->c.external_work += mpm_body_force_work(&sim->body_forces[b], &sim->sets[b]);
     }
     sim->c.v2_max = found.v2_max;
+    sim->c.drift += found.dx_max * sim->grid.inv_h;
+    sim->c.steps_since_sort++;
     advance_clock(sim, dt);
     mpm_probes_after_step(sim, dt);
     leave_stage_if_over(sim);

@@ -3,15 +3,14 @@
 //
 // Symmetric tensors (stress) are kept as 4 components in 2D (xx, yy, zz, xy) and 6 in 3D
 // (xx, yy, zz, xy, yz, zx). Tensors are passed by pointer: GCC 12.2 with AVX-512 miscompiles small
-// structs of doubles passed by value (docs/method.md).
+// structs of doubles passed by value (docs/method.md). Components are lanes (simd.h): double in
+// plain units.
 #pragma once
-#include <math.h>
-
-#define MPM_KERNEL static inline __attribute__((always_inline))
+#include "server/mpm/simd.h"
 
 #define MPM_SYM(dim) ((dim) == 2 ? 4 : 6) // stored components of a symmetric tensor
 
-MPM_KERNEL double mpm_det(const double *F, const int dim) {
+MPM_KERNEL mpm_vec mpm_det(const mpm_vec *F, const int dim) {
     if (dim == 2) {
         return F[0] * F[3] - F[1] * F[2];
     }
@@ -20,18 +19,18 @@ MPM_KERNEL double mpm_det(const double *F, const int dim) {
 }
 
 // det(1 + D) - 1 without the cancellation of forming 1 + D first.
-MPM_KERNEL double mpm_det_minus_one(const double *D, const int dim) {
+MPM_KERNEL mpm_vec mpm_det_minus_one(const mpm_vec *D, const int dim) {
     if (dim == 2) {
         return D[0] + D[3] + (D[0] * D[3] - D[1] * D[2]);
     }
-    const double trace = D[0] + D[4] + D[8];
-    const double minors =
+    const mpm_vec trace = D[0] + D[4] + D[8];
+    const mpm_vec minors =
         D[0] * D[4] - D[1] * D[3] + D[0] * D[8] - D[2] * D[6] + D[4] * D[8] - D[5] * D[7];
     return trace + (minors + mpm_det(D, 3));
 }
 
 // Determinant of a symmetric tensor in its storage; in 2D the out-of-plane component is a factor.
-MPM_KERNEL double mpm_det_sym(const double *s, const int dim) {
+MPM_KERNEL mpm_vec mpm_det_sym(const mpm_vec *s, const int dim) {
     if (dim == 2) {
         return (s[0] * s[1] - s[3] * s[3]) * s[2];
     }

@@ -11,33 +11,38 @@
 
 #define BATCH 64 // particles whose velocity gradient is kept for one call of a material's rate part
 
-// The nodes that one particle reaches: first node, and weights by direction.
+// The nodes that one particle reaches, row-major, and weights by direction.
 struct stencil {
-    size_t first;
+    uint32_t key, n_runs; // the cell whose nodes these are; how often it has changed
+    uint32_t nodes[MPM_MAX_STENCIL];
     double w[MPM_MAX_DIM][MPM_MAX_SUPPORT], dw[MPM_MAX_DIM][MPM_MAX_SUPPORT];
 };
+#define NO_CELL UINT32_MAX // no key: the domain has fewer nodes
 
 MPM_KERNEL void stencil_at(struct stencil *t, const struct mpm_span *span, size_t p, const int dim,
                            const enum mpm_basis basis) {
     const struct mpm_grid *g = span->grid;
-    t->first = 0;
+    int base[MPM_MAX_DIM];
     for (int d = 0; d < dim; d++) {
         const double xi = (span->s->x[mpm_at(p, dim, d)] - g->origin[d]) * g->inv_h;
-        const int base =
-            mpm_weights(basis, xi, span->s->half, span->s->inv_4_half, t->w[d], t->dw[d]);
-        t->first += (size_t)base * g->stride[d];
+        base[d] = mpm_weights(basis, xi, span->s->half, span->s->inv_4_half, t->w[d], t->dw[d]);
+    }
+    const uint32_t key = mpm_cell_key(g, base, dim);
+    if (key != t->key) {
+        mpm_grid_stencil(g, key, mpm_support(basis), dim, t->nodes);
+        t->key = key;
+        t->n_runs++;
     }
 }
 
-// The nodes of a stencil lie in rows along the last direction, where they are neighbours in memory.
-// FOR_ROWS runs its body for each row, with its first node and the product of the weights (or, for
-// direction e, of the gradient's factors, per cell) of the other directions. All bounds are
-// constants.
+// The nodes of a stencil in rows along the last direction. FOR_ROWS runs its body for each row,
+// with its nodes and the product of the weights (or, for direction e, of the gradient's factors,
+// per cell) of the other directions. All bounds are constants.
 #define FOR_ROWS(dim, basis)                                                                       \
     for (int a_ = 0; a_ < mpm_support(basis); a_++)                                                \
         for (int b_ = 0; b_ < ((dim) == 3 ? mpm_support(basis) : 1); b_++)
-#define ROW_NODE(t, g, dim)                                                                        \
-    ((t).first + (size_t)a_ * (g)->stride[0] + ((dim) == 3 ? (size_t)b_ * (g)->stride[1] : 0))
+#define ROW_NODES(t, dim, basis)                                                                   \
+    ((t).nodes + (((dim) == 3 ? a_ * mpm_support(basis) + b_ : a_) * mpm_support(basis)))
 #define ROW_WEIGHT(t, dim) ((t).w[0][a_] * ((dim) == 3 ? (t).w[1][b_] : 1))
 #define ROW_GRADIENT(t, dim, e)                                                                    \
     (((e) == 0 ? (t).dw[0][a_] : (t).w[0][a_]) * ((dim) == 2 ? 1                                   \
@@ -45,15 +50,16 @@ MPM_KERNEL void stencil_at(struct stencil *t, const struct mpm_span *span, size_
                                                              : (t).w[1][b_]))
 
 // eqs. 7, 8, 10. The internal force is -sum_p V sigma grad w.
-MPM_KERNEL void p2g(const struct mpm_span *span, const int dim, const enum mpm_basis basis) {
+MPM_KERNEL void p2g(const struct mpm_span *span, struct mpm_span_result *result, const int dim,
+                    const enum mpm_basis basis) {
     const struct mpm_particles *s = span->s;
     const struct mpm_grid *g = span->grid;
     const int last = dim - 1;
+    struct stencil t = {.key = NO_CELL};
     for (size_t p = span->begin; p < span->end; p++) {
-        struct stencil t;
         stencil_at(&t, span, p, dim, basis);
         const double m = s->density * s->V0[p];
-        const double V_over_h = s->V[p] * g->inv_h;
+        const double V_over_h = s->V[p] * g->inv_h, V_fbar = span->fbar ? s->V[p] : 0;
         double mv[3], V_sigma[6];
         for (int d = 0; d < dim; d++) {
             mv[d] = m * s->v[mpm_at(p, dim, d)];
@@ -62,8 +68,8 @@ MPM_KERNEL void p2g(const struct mpm_span *span, const int dim, const enum mpm_b
             V_sigma[k] = V_over_h * s->sigma[mpm_at(p, MPM_SYM(dim), k)];
         }
         FOR_ROWS(dim, basis) {
-            double *row = g->node + ROW_NODE(t, g, dim) * MPM_NODE(dim);
-            const double w_row = ROW_WEIGHT(t, dim), m_row = w_row * m;
+            const uint32_t *row = ROW_NODES(t, dim, basis);
+            const double w_row = ROW_WEIGHT(t, dim), m_row = w_row * m, V_row = w_row * V_fbar;
             double mv_row[3], f_w[3], f_dw[3]; // force = f_w w + f_dw dw along the row
             for (int d = 0; d < dim; d++) {
                 mv_row[d] = w_row * mv[d];
@@ -74,9 +80,10 @@ MPM_KERNEL void p2g(const struct mpm_span *span, const int dim, const enum mpm_b
                 }
             }
             for (int c = 0; c < mpm_support(basis); c++) {
-                double *node = row + c * MPM_NODE(dim);
+                double *node = g->node + (size_t)row[c] * MPM_NODE;
                 const double w = t.w[last][c], dw = t.dw[last][c];
                 node[0] += w * m_row;
+                node[MPM_NODE_VOLUME(dim)] += w * V_row;
                 for (int d = 0; d < dim; d++) {
                     node[1 + d] += w * mv_row[d];
                     node[1 + dim + d] += w * f_w[d] + dw * f_dw[d];
@@ -84,32 +91,26 @@ MPM_KERNEL void p2g(const struct mpm_span *span, const int dim, const enum mpm_b
             }
         }
     }
+    result->n_runs = t.n_runs;
 }
 
 MPM_KERNEL void force(const struct mpm_span *span, const uint32_t *particle, const double *f,
                       size_t n, const int dim, const enum mpm_basis basis) {
     const struct mpm_grid *g = span->grid;
+    struct stencil t = {.key = NO_CELL};
     for (size_t k = 0; k < n; k++) {
-        struct stencil t;
         stencil_at(&t, span, particle[k], dim, basis);
         FOR_ROWS(dim, basis) {
-            double *row = g->node + ROW_NODE(t, g, dim) * MPM_NODE(dim);
+            const uint32_t *row = ROW_NODES(t, dim, basis);
             for (int c = 0; c < mpm_support(basis); c++) {
                 const double w = ROW_WEIGHT(t, dim) * t.w[dim - 1][c];
                 for (int d = 0; d < dim; d++) {
-                    row[c * MPM_NODE(dim) + 1 + dim + d] += w * f[k * (size_t)dim + (size_t)d];
+                    g->node[(size_t)row[c] * MPM_NODE + (size_t)(1 + dim + d)] +=
+                        w * f[k * (size_t)dim + (size_t)d];
                 }
             }
         }
     }
-}
-
-static struct mpm_span_result empty_result(void) {
-    return (struct mpm_span_result){
-        .min = {INFINITY, INFINITY, INFINITY},
-        .max = {-INFINITY, -INFINITY, -INFINITY},
-        .bad = SIZE_MAX,
-    };
 }
 
 static void fault(struct mpm_span_result *r, size_t p, enum mpm_status status, double value) {
@@ -134,6 +135,7 @@ MPM_KERNEL void finish(const struct mpm_span *span, size_t begin, size_t end,
             const double step = dx ? dx[p - begin][d] : s->dx[mpm_at(p, dim, d)];
             *x += step;
             r->mass_dx[d] += m * step;
+            r->dx_max = fabs(step) > r->dx_max ? fabs(step) : r->dx_max;
             r->min[d] = *x < r->min[d] ? *x : r->min[d];
             r->max[d] = *x > r->max[d] ? *x : r->max[d];
             if (!(fabs(*x) < INFINITY)) {
@@ -212,23 +214,23 @@ MPM_KERNEL void g2p(const struct mpm_span *span, struct mpm_span_result *result,
     const struct mpm_grid *g = span->grid;
     const int last = dim - 1;
     const bool fbar = span->fbar;
-    struct mpm_span_result r = empty_result();
+    struct mpm_span_result r = mpm_nothing_found();
+    struct stencil t = {.key = NO_CELL};
     double L[BATCH][9], dx[BATCH][3];
     for (size_t begin = span->begin; begin < span->end; begin += BATCH) {
         const size_t end = begin + BATCH < span->end ? begin + BATCH : span->end;
         for (size_t p = begin; p < end; p++) {
-            struct stencil t;
             stencil_at(&t, span, p, dim, basis);
             double v_pic[3] = {0}, dv[3] = {0}, *l = L[p - begin];
             for (int k = 0; k < dim * dim; k++) {
                 l[k] = 0;
             }
             FOR_ROWS(dim, basis) {
-                const double *row = g->velocity + ROW_NODE(t, g, dim) * MPM_VELOCITY(dim);
+                const uint32_t *row = ROW_NODES(t, dim, basis);
                 const double w_row = ROW_WEIGHT(t, dim);
                 double v_w[3] = {0}, v_dw[3] = {0}, dv_w[3] = {0}; // sums along the row
                 for (int c = 0; c < mpm_support(basis); c++) {
-                    const double *v = row + c * MPM_VELOCITY(dim);
+                    const double *v = g->velocity + (size_t)row[c] * MPM_VELOCITY(dim);
                     for (int d = 0; d < dim; d++) {
                         v_w[d] += t.w[last][c] * v[d];
                         v_dw[d] += t.dw[last][c] * v[d];
@@ -294,9 +296,9 @@ MPM_KERNEL void fbar_scatter(const struct mpm_span *span, const int dim, const e
                              const enum mpm_fbar_scheme scheme) {
     const struct mpm_particles *s = span->s;
     const struct mpm_grid *g = span->grid;
-    const size_t stride = scheme == MPM_FBAR_ANCHORED ? 3 : 2;
+    const size_t stride = scheme == MPM_FBAR_ANCHORED ? 2 : 1;
+    struct stencil t = {.key = NO_CELL};
     for (size_t p = span->begin; p < span->end; p++) {
-        struct stencil t;
         stencil_at(&t, span, p, dim, basis);
         const double V = s->V[p], trial = mpm_ratio_in_use(s, p);
         double a = V * trial, b = 0;
@@ -305,15 +307,14 @@ MPM_KERNEL void fbar_scatter(const struct mpm_span *span, const int dim, const e
             b = (1 - span->a) * V * trial + span->a * a * (V / s->V0[p]);
         }
         FOR_ROWS(dim, basis) {
-            double *row = g->fbar + ROW_NODE(t, g, dim) * stride;
+            const uint32_t *row = ROW_NODES(t, dim, basis);
             const double w_row = ROW_WEIGHT(t, dim);
             for (int c = 0; c < mpm_support(basis); c++) {
-                double *node = row + (size_t)c * stride;
+                double *node = g->fbar + row[c] * stride;
                 const double w = w_row * t.w[dim - 1][c];
-                node[0] += w * V;
-                node[1] += w * a;
+                node[0] += w * a;
                 if (scheme == MPM_FBAR_ANCHORED) {
-                    node[2] += w * b;
+                    node[1] += w * b;
                 }
             }
         }
@@ -325,20 +326,20 @@ MPM_KERNEL void fbar_finish(const struct mpm_span *span, struct mpm_span_result 
                             const enum mpm_fbar_scheme scheme) {
     struct mpm_particles *s = span->s;
     const struct mpm_grid *g = span->grid;
-    const size_t stride = scheme == MPM_FBAR_ANCHORED ? 3 : 2;
-    struct mpm_span_result r = empty_result();
+    const size_t stride = scheme == MPM_FBAR_ANCHORED ? 2 : 1;
+    struct mpm_span_result r = mpm_nothing_found();
+    struct stencil t = {.key = NO_CELL};
     for (size_t p = span->begin; p < span->end; p++) {
-        struct stencil t;
         stencil_at(&t, span, p, dim, basis);
         double A = 0, B = 0;
         FOR_ROWS(dim, basis) {
-            const double *row = g->fbar + ROW_NODE(t, g, dim) * stride;
+            const uint32_t *row = ROW_NODES(t, dim, basis);
             double A_row = 0, B_row = 0;
             for (int c = 0; c < mpm_support(basis); c++) {
-                const double *node = row + (size_t)c * stride;
-                A_row += t.w[dim - 1][c] * node[1];
+                const double *node = g->fbar + row[c] * stride;
+                A_row += t.w[dim - 1][c] * node[0];
                 if (scheme == MPM_FBAR_ANCHORED) {
-                    B_row += t.w[dim - 1][c] * node[2];
+                    B_row += t.w[dim - 1][c] * node[1];
                 }
             }
             A += ROW_WEIGHT(t, dim) * A_row;
@@ -389,8 +390,8 @@ MPM_KERNEL void fbar_finish(const struct mpm_span *span, struct mpm_span_result 
     X(2, GIMP) X(2, BSPLINE2) X(2, BSPLINE3) X(3, LINEAR) X(3, GIMP) X(3, BSPLINE2) X(3, BSPLINE3)
 
 #define DEFINE(D, B)                                                                               \
-    static void p2g_##D##d_##B(const struct mpm_span *span) {                                      \
-        p2g(span, D, MPM_##B);                                                                     \
+    static void p2g_##D##d_##B(const struct mpm_span *span, struct mpm_span_result *result) {      \
+        p2g(span, result, D, MPM_##B);                                                             \
     }                                                                                              \
     static void g2p_##D##d_##B(const struct mpm_span *span, struct mpm_span_result *result) {      \
         switch (span->s->material->kinematics) {                                                   \
@@ -435,6 +436,6 @@ KERNELS(DEFINE)
     },
 static const struct mpm_kernels table[] = {KERNELS(ENTRY)};
 
-const struct mpm_kernels *mpm_kernels(int dim, enum mpm_basis basis) {
+const struct mpm_kernels *mpm_kernels_plain(int dim, enum mpm_basis basis) {
     return &table[(dim - 2) * MPM_N_BASES + (int)basis];
 }

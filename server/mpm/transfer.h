@@ -17,22 +17,31 @@ struct mpm_span {
 struct mpm_span_result {
     double min[MPM_MAX_DIM], max[MPM_MAX_DIM]; // m, new positions
     double v2_max;                             // (m/s)^2
+    double dx_max;                             // m, largest displacement along an axis
     double mass_dx[MPM_MAX_DIM];               // kg m, sum of mass times displacement of this step
+    uint32_t n_runs;                           // particles of one cell that follow each other
+    enum mpm_status status;                    // of the first fault
     size_t bad;                                // first particle at fault, or SIZE_MAX
-    enum mpm_status status;                    // of its fault
     double value;
 };
+static inline struct mpm_span_result mpm_nothing_found(void) {
+    return (struct mpm_span_result){
+        .min = {INFINITY, INFINITY, INFINITY},
+        .max = {-INFINITY, -INFINITY, -INFINITY},
+        .bad = SIZE_MAX,
+    };
+}
 
 struct mpm_kernels {
-    // eqs. 7, 8, 10: mass, momentum and internal force to the grid.
-    void (*p2g)(const struct mpm_span *span);
-    // A force on each of n particles (indices, ascending) to the grid: f_i += w_ip f_p.
+    // eqs. 7, 8, 10: mass, momentum, internal force and, with F-bar, volume to the grid.
+    void (*p2g)(const struct mpm_span *span, struct mpm_span_result *result);
+    // A force on each of n particles (their places) to the grid: f_i += w_ip f_p.
     void (*force)(const struct mpm_span *span, const uint32_t *particle, const double *f, size_t n);
     // eqs. 11-17: velocity, and the deformation with the plain increment; then, where F-bar is off,
     // stress and position. With F-bar on it leaves dx and dJ for fbar_finish.
     void (*g2p)(const struct mpm_span *span, struct mpm_span_result *result);
-    // eq. 19, with the volume of time n: V and V Jbar dJ (or the sums of the anchored scheme) to
-    // the grid.
+    // eq. 19, with the volume of time n: V Jbar dJ (or the sums of the anchored scheme) to the
+    // grid, where P2G has left V.
     void (*fbar_scatter[MPM_N_FBAR_SCHEMES])(const struct mpm_span *span);
     // eqs. 20, 25: averaged ratio to the particles, deformation scaled to it; then stress and
     // position.
@@ -40,5 +49,5 @@ struct mpm_kernels {
                                             struct mpm_span_result *result);
 };
 
-// The kernels of a dimension (2, 3) and basis; static.
-const struct mpm_kernels *mpm_kernels(int dim, enum mpm_basis basis);
+// The plain scalar kernels of a dimension (2, 3) and basis; static.
+const struct mpm_kernels *mpm_kernels_plain(int dim, enum mpm_basis basis);

@@ -12,6 +12,7 @@
 
 #include "server/mpm/basis.h"
 #include "server/mpm/sim.h"
+#include "tests/unit/nodes.h"
 
 static void near_at(double a, double b, double tol, int line) {
     if (!(fabs(a - b) <= tol)) {
@@ -115,8 +116,7 @@ static void velocity_at(const struct mpm_sim *sim, const double *x, double *v) {
     }
     for (int i = 0; i < reach; i++) {
         for (int j = 0; j < reach; j++) {
-            const size_t node =
-                (size_t)(base[0] + i) * g->stride[0] + (size_t)(base[1] + j) * g->stride[1];
+            const size_t node = mpm_node_at(g, (int[]){base[0] + i, base[1] + j, 0});
             for (int d = 0; d < 2; d++) {
                 v[d] += w[0][i] * w[1][j] * g->velocity[node * 4 + (size_t)d];
             }
@@ -149,9 +149,12 @@ static void test_boundary_normal_velocity_vanishes(void **state) {
                         }
                     }
                 }
-                for (int i = g->lo[0]; i < g->hi[0] && !folds(basis); i++) {
-                    for (int j = g->lo[1]; j < g->hi[1]; j++) {
-                        const double *v = g->velocity + 4 * ((size_t)i * g->stride[0] + (size_t)j);
+                FOR_NODES(g, n) {
+                    const double *v = g->velocity + 4 * n;
+                    int place[MPM_MAX_DIM];
+                    node_place(g, n, place);
+                    const int i = place[0], j = place[1];
+                    if (!folds(basis)) {
                         assert_true(i > MPM_PAD || v[0] == 0);
                         assert_true(j > MPM_PAD || v[1] == 0);
                         if (condition == MPM_WALL_FIXED && (i <= MPM_PAD || j <= MPM_PAD)) {

@@ -11,6 +11,7 @@
 #include <cmocka.h>
 
 #include "server/mpm/sim.h"
+#include "tests/unit/nodes.h"
 
 static void near_at(double a, double b, double tol, int line) {
     if (!(fabs(a - b) <= tol)) {
@@ -111,7 +112,8 @@ static void test_load_chooses_the_outermost_layer(void **state) {
             const struct mpm_load *load = &sim->loads[0];
             assert_int_equal(load->n, dim == 2 ? 8 : 64);
             for (size_t k = 0; k < load->n; k++) {
-                const double x = sim->sets[0].x[mpm_at(load->particle[k], dim, side / 2)];
+                const double x = sim->sets[0].x[mpm_at(
+                    mpm_place_of(&sim->sets[load->def.body], load->particle[k]), dim, side / 2)];
                 assert_near(x, side % 2 ? HIGH - H / 4 : LOW + H / 4, 1e-15);
                 assert_true(k == 0 || load->particle[k] > load->particle[k - 1]);
             }
@@ -158,9 +160,9 @@ static void test_load_total_is_the_given_force(void **state) {
         double F[3], nodes[3] = {0};
         total(sim, 0, F);
         step(sim); // from rest: nodal forces are the load's alone
-        for (size_t i = 0; i < sim->grid.n_nodes; i++) {
+        FOR_NODES(&sim->grid, i) {
             for (int d = 0; d < dim; d++) {
-                nodes[d] += sim->grid.node[i * (size_t)MPM_NODE(dim) + 1 + (size_t)(dim + d)];
+                nodes[d] += sim->grid.node[i * MPM_NODE + 1 + (size_t)(dim + d)];
             }
         }
         for (int d = 0; d < dim; d++) {
@@ -303,7 +305,11 @@ static void test_load_pressure_in_a_ring(void **state) {
                 for (size_t k = 0; k < load->n; k++) {
                     double dot = 0, r2 = 0, f2 = 0;
                     for (int d = 0; d < dim; d++) {
-                        const double r = sim->sets[0].x[mpm_at(load->particle[k], dim, d)] - 1;
+                        const double r =
+                            sim->sets[0].x[mpm_at(
+                                mpm_place_of(&sim->sets[load->def.body], load->particle[k]), dim,
+                                d)] -
+                            1;
                         const double f = load->force[k * (size_t)dim + (size_t)d];
                         dot += d == axis && dim == 3 ? 0 : r * f;
                         r2 += d == axis && dim == 3 ? 0 : r * r;

@@ -47,7 +47,7 @@ static void create(struct mpm_particles *s, const char *model, const double *par
     *s = (struct mpm_particles){.material = mpm_material_find(model), .dim = dim};
     memcpy(s->parameters, parameters, 6 * sizeof *parameters);
     s->density = parameters[0];
-    assert_true(mpm_particles_create(s, n, false, false));
+    assert_true(mpm_particles_create(s, n, 0));
 }
 
 // F, or b = F F^T where that is kept.

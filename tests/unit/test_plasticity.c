@@ -46,7 +46,7 @@ static void create(const double *parameters, int dim, size_t n) {
     s = (struct mpm_particles){.material = mpm_material_find("hencky_j2"), .dim = dim};
     memcpy(s.parameters, parameters, MPM_MAX_PARAMETERS * sizeof *parameters);
     s.density = parameters[0];
-    assert_true(mpm_particles_create(&s, n, false, false));
+    assert_true(mpm_particles_create(&s, n, 0));
 }
 
 #define FOR_LAWS(dim, par)                                                                         \

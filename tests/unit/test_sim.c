@@ -805,9 +805,7 @@ static void test_sim_bytes_are_those_estimated(void **state) {
                 assert_int_equal(estimate.nodes, mpm_n_nodes(sim));
                 assert_near(estimate.dt, mpm_next_dt(sim), 0);
                 assert_near(estimate.dt_limit, mpm_dt_limit(sim), 1e-15);
-                // Each of the three grid arrays is rounded up to whole cache lines.
-                assert_true(mpm_bytes(sim) >= estimate.bytes &&
-                            mpm_bytes(sim) < estimate.bytes + 3 * 64);
+                assert_int_equal(mpm_bytes(sim), estimate.bytes);
                 mpm_free(sim);
             }
         }

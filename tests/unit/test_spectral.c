@@ -60,6 +60,38 @@ static double size_of(const double *s, int dim) {
     return largest;
 }
 
+// As mpm_half_log, whose series is held against the eigenvalues wherever it is used. b carries eps
+// |b|, which is worth eps |b| |b^-1|, at most 2.25 in the series' reach.
+static void half_log(const double *b, double *e, int dim) {
+    double far[6];
+    if (dim == 2) {
+        mpm_half_log(b, e, 2);
+    } else {
+        mpm_half_log(b, e, 3);
+    }
+    mpm_half_log_far(b, far, dim, 1, 1);
+    double largest = 0;
+    for (int k = 0; k < MPM_SYM(dim); k++) {
+        largest = fmax(largest, fabs(far[k]));
+    }
+    for (int k = 0; largest < MPM_SERIES_REACH && k < MPM_SYM(dim); k++) {
+        assert_near(e[k], far[k], 4 * DBL_EPSILON);
+    }
+}
+
+static void exp_twice(const double *e, double *b, int dim) {
+    double far[6];
+    if (dim == 2) {
+        mpm_exp_twice(e, b, 2);
+    } else {
+        mpm_exp_twice(e, b, 3);
+    }
+    mpm_exp_twice_far(e, far, dim, 1, 1);
+    for (int k = 0; k < MPM_SYM(dim); k++) {
+        assert_near(b[k], far[k], 8 * DBL_EPSILON * size_of(far, dim) * (1 + size_of(e, dim)));
+    }
+}
+
 #define FOR_ROTATED(dim, trial)                                                                    \
     for (int dim = 2; dim <= 3; dim++)                                                             \
         for (int trial = 0; trial < 200; trial++)
@@ -75,8 +107,8 @@ static void test_spectral_log_undoes_exp(void **state) {
             }
             rotation(Q, dim);
             compose(w, Q, e, dim);
-            mpm_exp_twice(e, b, dim);
-            mpm_half_log(b, back, dim);
+            exp_twice(e, b, dim);
+            half_log(b, back, dim);
             const double spread = fmax(fmax(w[0], w[1]), w[2]) - fmin(fmin(w[0], w[1]), w[2]);
             for (int k = 0; k < MPM_SYM(dim); k++) {
                 assert_near(back[k], e[k], 16 * DBL_EPSILON * (exp(2 * spread) + size));
@@ -98,12 +130,12 @@ static void test_spectral_log_and_exp_are_those_of_the_eigenvalues(void **state)
             rotation(Q, dim);
             compose(w, Q, e, dim);
             compose(twice, Q, exact, dim);
-            mpm_exp_twice(e, b, dim);
+            exp_twice(e, b, dim);
             for (int k = 0; k < MPM_SYM(dim); k++) { // a few eps of the largest eigenvalue
                 assert_near(b[k], exact[k], 32 * DBL_EPSILON * (1 + size) * size_of(exact, dim));
             }
             const double spread = fmax(fmax(w[0], w[1]), w[2]) - fmin(fmin(w[0], w[1]), w[2]);
-            mpm_half_log(exact, b, dim);
+            half_log(exact, b, dim);
             for (int k = 0; k < MPM_SYM(dim); k++) {
                 assert_near(b[k], e[k], 16 * DBL_EPSILON * (exp(2 * spread) + size));
             }
@@ -131,11 +163,11 @@ static void test_spectral_repeated_eigenvalues(void **state) {
                 }
                 compose(w, Q, exact, dim);
                 compose(wb, Q, b, dim);
-                mpm_half_log(b, e, dim);
+                half_log(b, e, dim);
                 for (int k = 0; k < MPM_SYM(dim); k++) {
                     assert_near(e[k], exact[k], 2e-15); // a few eps at a condition of 2
                 }
-                mpm_exp_twice(exact, e, dim);
+                exp_twice(exact, e, dim);
                 for (int k = 0; k < MPM_SYM(dim); k++) {
                     assert_near(e[k], b[k], 1e-14); // b reaches 1.8
                 }
@@ -151,8 +183,8 @@ static void test_spectral_isotropic_is_exact(void **state) {
             const double lambda = pow(10, k / 10.0);
             const double b[6] = {lambda, lambda, lambda};
             double e[6], back[6];
-            mpm_half_log(b, e, dim);
-            mpm_exp_twice(e, back, dim);
+            half_log(b, e, dim);
+            exp_twice(e, back, dim);
             for (int c = 0; c < MPM_SYM(dim); c++) {
                 const double expected = c < 3 ? log(lambda) / 2 : 0;
                 assert_near(e[c], expected, c < 3 ? 4 * DBL_EPSILON * (1 + fabs(expected)) : 0);
@@ -162,12 +194,12 @@ static void test_spectral_isotropic_is_exact(void **state) {
         }
         const double one[6] = {1, 1, 1};
         double e[6];
-        mpm_half_log(one, e, dim);
+        half_log(one, e, dim);
         for (int c = 0; c < MPM_SYM(dim); c++) {
             assert_true(e[c] == 0);
         }
         double b[6];
-        mpm_exp_twice(e, b, dim);
+        exp_twice(e, b, dim);
         assert_memory_equal(b, one, (size_t)MPM_SYM(dim) * sizeof *b);
     }
 }
@@ -180,12 +212,12 @@ static void test_spectral_extreme_on_the_axes(void **state) {
         for (int i = 0; i < 7 * 7 * 7; i++) {
             const double b[6] = {extremes[i % 7], extremes[i / 7 % 7], extremes[i / 49]};
             double e[6], back[6];
-            mpm_half_log(b, e, dim);
+            half_log(b, e, dim);
             for (int c = 0; c < MPM_SYM(dim); c++) {
                 const double expected = c < 3 ? log(b[c]) / 2 : 0;
                 assert_near(e[c], expected, 8 * DBL_EPSILON * 32); // logarithms of the size of 32
             }
-            mpm_exp_twice(e, back, dim);
+            exp_twice(e, back, dim);
             for (int c = 0; c < MPM_SYM(dim); c++) {
                 assert_near(back[c], b[c], c < 3 ? 1e-13 * b[c] : 0); // 2 e eps = 64 eps, twice
             }
@@ -208,7 +240,7 @@ static void test_spectral_extreme_in_rotated_frames(void **state) {
                 }
                 rotation(Q, dim);
                 compose(wb, Q, b, dim);
-                mpm_half_log(b, e, dim);
+                half_log(b, e, dim);
                 // Trace = ln(det)/2, whose error is that of the small eigenvalue alone.
                 const double tol = 16 * DBL_EPSILON * (pow(10, k) + 32); // of logarithms up to 32
                 double exact[6];
@@ -233,7 +265,7 @@ static void test_spectral_exp_keeps_the_determinant(void **state) {
             }
             rotation(Q, dim);
             compose(w, Q, e, dim);
-            mpm_exp_twice(e, b, dim);
+            exp_twice(e, b, dim);
             const double trace = w[0] + w[1] + w[2];
             const double spread = fmax(fmax(w[0], w[1]), w[2]) - fmin(fmin(w[0], w[1]), w[2]);
             // det in this form cancels terms of the size of the largest products.
@@ -256,15 +288,15 @@ static void test_spectral_2d_is_3d(void **state) {
             compose(w, Q, e, 2);
             const double spread = fmax(fmax(w[0], w[1]), w[2]) - fmin(fmin(w[0], w[1]), w[2]);
             const double full[6] = {e[0], e[1], e[2], e[3]};
-            mpm_exp_twice(e, flat, 2);
-            mpm_exp_twice(full, solid, 3);
+            exp_twice(e, flat, 2);
+            exp_twice(full, solid, 3);
             for (int k = 0; k < 6; k++) {
                 assert_near(solid[k], k < 4 ? flat[k] : 0,
                             32 * DBL_EPSILON * (1 + size) * size_of(flat, 2));
             }
             double in[6] = {flat[0], flat[1], flat[2], flat[3]};
-            mpm_half_log(flat, e, 2);
-            mpm_half_log(in, solid, 3);
+            half_log(flat, e, 2);
+            half_log(in, solid, 3);
             for (int k = 0; k < 6; k++) {
                 assert_near(solid[k], k < 4 ? e[k] : 0,
                             16 * DBL_EPSILON * (exp(2 * spread) + size));
@@ -273,31 +305,59 @@ static void test_spectral_2d_is_3d(void **state) {
     }
 }
 
-// Where the series hands over to Jacobi (3D) and the quotients to their limits (2D), the two sides
-// agree: along a line through the switch, log has no step beyond its slope.
+static double norm_of(const double *s, int dim) {
+    double norm2 = 0;
+    for (int k = 0; k < MPM_SYM(dim); k++) {
+        norm2 += (k < 3 ? 1 : 2) * s[k] * s[k];
+    }
+    return sqrt(norm2);
+}
+
+// Where the series hand over to the eigenvalues, and these to their limits (2D), the two sides
+// agree: along a line through the switch there is no step beyond the slope.
 static void test_spectral_is_continuous_at_its_switches(void **state) {
     (void)state;
     for (int trial = 0; trial < 200; trial++) {
-        double B[6], size = 0, e[2][6];
-        for (int k = 0; k < 6; k++) {
-            B[k] = uniform();
-            size += fabs(B[k]);
-        }
-        for (int side = 0; side < 2; side++) {
-            const double t = 2 * MPM_SERIES_REACH / size * (1 + (side ? 1e-14 : -1e-14));
-            double b[6];
-            for (int k = 0; k < 6; k++) {
-                b[k] = t * B[k] + (k < 3);
+        for (int dim = 2; dim <= 3; dim++) {
+            double w[3], Q[9], wb[3], x[6], in[6], e[2][6];
+            rotation(Q, dim);
+            for (int d = 0; d < 3; d++) {
+                w[d] = uniform();
             }
-            mpm_half_log(b, e[side], 3);
-        }
-        for (int k = 0; k < 6; k++) {
-            assert_near(e[1][k], e[0][k], 1e-15); // slope 1/2 over 2e-14 of 0.04, and round-off
+            compose(w, Q, x, dim);
+            const double scale = MPM_SERIES_REACH / norm_of(x, dim);
+            for (int side = 0; side < 2; side++) {
+                for (int d = 0; d < 3; d++) {
+                    const double X = w[d] * scale * (1 + (side ? 1e-14 : -1e-14));
+                    wb[d] = (1 + X) / (1 - X);
+                }
+                compose(wb, Q, in, dim);
+                mpm_half_log(in, e[side], dim);
+            }
+            for (int k = 0; k < MPM_SYM(dim); k++) {
+                assert_near(e[1][k], e[0][k], 5e-15); // slope 1 over 4e-15, and round-off
+            }
+            const double mean = (w[0] + w[1] + w[2]) / 3;
+            for (int d = 0; d < 3; d++) {
+                w[d] -= mean;
+            }
+            compose(w, Q, x, dim);
+            const double half = MPM_SERIES_REACH / norm_of(x, dim) / 2;
+            for (int side = 0; side < 2; side++) {
+                for (int k = 0; k < MPM_SYM(dim); k++) {
+                    in[k] = x[k] * half * (1 + (side ? 1e-14 : -1e-14));
+                }
+                mpm_exp_twice(in, e[side], dim);
+            }
+            for (int k = 0; k < MPM_SYM(dim); k++) {
+                assert_near(e[1][k], e[0][k], 6e-15); // slope 1.2 over 4e-15, and round-off
+            }
         }
         const double c = cos(3 * uniform()), s = sqrt(1 - c * c);
+        double e[2][4];
         for (int side = 0; side < 2; side++) {
             const double r = 1e-4 * (1 + (side ? 1e-14 : -1e-14));
-            const double b[4] = {1 + r * c, 1 - r * c, 1.1, r * s};
+            const double b[4] = {1 + r * c, 1 - r * c, 2, r * s}; // 2: out of the series' reach
             mpm_half_log(b, e[side], 2);
         }
         for (int k = 0; k < 4; k++) {
@@ -305,7 +365,7 @@ static void test_spectral_is_continuous_at_its_switches(void **state) {
         }
         for (int side = 0; side < 2; side++) {
             const double r = 0.5e-4 * (1 + (side ? 1e-14 : -1e-14)); // of e; half of that of 2 e
-            const double in[4] = {r * c / 2, -r * c / 2, 0.1, r * s / 2};
+            const double in[4] = {r * c / 2, -r * c / 2, 0.2, r * s / 2};
             mpm_exp_twice(in, e[side], 2);
         }
         for (int k = 0; k < 4; k++) {
@@ -333,7 +393,7 @@ static void test_spectral_log_is_linear_near_the_identity(void **state) {
                 for (int c = 0; c < MPM_SYM(dim); c++) {
                     b[c] = (c < 3) + t * uniform();
                 }
-                mpm_half_log(b, e, dim);
+                half_log(b, e, dim);
                 for (int c = 0; c < MPM_SYM(dim); c++) {
                     assert_near(e[c], (b[c] - (c < 3)) / 2, t * t * 1.5 + DBL_EPSILON);
                 }
@@ -352,7 +412,7 @@ static void test_spectral_exp_of_pure_shear(void **state) {
             rotation(Q, trial % 2 ? 3 : 2);
             compose(w, Q, e, 3);
             compose(wb, Q, exact, 3);
-            mpm_exp_twice(e, b, 3);
+            exp_twice(e, b, 3);
             for (int k = 0; k < 6; k++) {
                 assert_near(b[k], exact[k], 32 * DBL_EPSILON * (1 + size) * wb[0]);
             }
@@ -360,7 +420,7 @@ static void test_spectral_exp_of_pure_shear(void **state) {
         for (int c = 3; c < 6; c++) { // a zero diagonal
             double e[6] = {0}, b[6];
             e[c] = size;
-            mpm_exp_twice(e, b, 3);
+            exp_twice(e, b, 3);
             assert_near(b[c], sinh(2 * size), 8 * DBL_EPSILON * cosh(2 * size));
             assert_near(b[mpm_sym_row(c)], cosh(2 * size), 8 * DBL_EPSILON * cosh(2 * size));
             const int alone = 3 - mpm_sym_row(c) - mpm_sym_column(c);

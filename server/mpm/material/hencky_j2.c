@@ -5,10 +5,80 @@
 // sum sqrt(2/3) |d eps_p| and sigma_y(a) = residual + (peak - residual) exp(-softening a). With
 // logarithmic strains the return map is the radial return of small strains (Simo 1992), and plastic
 // flow keeps the volume: J = sqrt(det b_e).
-#include <float.h>
-
-#include "server/mpm/particles.h"
 #include "server/mpm/spectral.h"
+
+struct hencky_j2 {
+    double two_mu, K; // Pa
+    double residual,
+        fall;         // Pa, sqrt(2/3) of the residual strength and of the peak's excess over it
+    double softening; // 1
+};
+
+#define HENCKY_J2_ROOT 0.81649658092772603 // sqrt(2/3)
+
+// sqrt(2/3) (sigma_y(a) - residual)
+MPM_KERNEL mpm_vec hencky_j2_soft(const struct hencky_j2 *c, mpm_vec a) {
+    return c->fall > 0 ? c->fall * mpm_exp(-c->softening * a) : mpm_splat(0);
+}
+
+// The radial return from |dev tau| = norm, where `yields`: the new plastic strain a, and soft at
+// it. g(x) = norm - 2 mu x - residual - soft(a + sqrt(2/3) x), with x = |d eps_p|, is concave and
+// falling, so Newton's iterates come down to the root from above after the first.
+MPM_KERNEL void hencky_j2_return(const struct hencky_j2 *c, mpm_vec norm, mpm_mask yields,
+                                 mpm_vec *a, mpm_vec *soft) {
+    const double rate = HENCKY_J2_ROOT * c->softening; // soft' = -rate soft
+    mpm_vec x = mpm_splat(0);
+    for (int k = 0; k < 50; k++) { // quadratic: 1 where nothing softens, else 2 or 3 in practice
+        const mpm_vec g = norm - c->two_mu * x - c->residual - *soft;
+        const mpm_vec step = g / (c->two_mu - rate * *soft), d = rate * step;
+        x = mpm_select(yields, x + step, x);
+        // What the step leaves of g is its second order, soft d^2/2.
+        const mpm_mask done = *soft * d * d <= DBL_EPSILON * norm;
+        *soft = mpm_select(yields, *soft * (1.0 - d + 0.5 * d * d), *soft);
+        *a = mpm_select(yields & done, *a + HENCKY_J2_ROOT * x, *a);
+        yields &= mpm_not(done);
+        if (!mpm_any(yields)) {
+            break;
+        }
+        *soft = mpm_select(yields, hencky_j2_soft(c, *a + HENCKY_J2_ROOT * x), *soft);
+    }
+}
+
+MPM_KERNEL void hencky_j2_stress(const struct hencky_j2 *c, mpm_vec *b, mpm_vec *a, mpm_vec *sigma,
+                                 const int dim) {
+    mpm_vec e[6], norm2 = mpm_splat(0);
+    mpm_half_log(b, e, dim);
+    const mpm_vec trace = e[0] + e[1] + e[2], mean = trace * (1.0 / 3);
+    for (int k = 0; k < MPM_SYM(dim); k++) {
+        e[k] = k < 3 ? e[k] - mean : e[k];
+        norm2 += (k < 3 ? 1.0 : 2.0) * e[k] * e[k];
+    }
+    const mpm_vec norm = c->two_mu * mpm_sqrt(norm2);
+    mpm_vec soft = hencky_j2_soft(c, *a);
+    const mpm_mask yields = norm > c->residual + soft;
+    if (mpm_any(yields)) {
+        hencky_j2_return(c, norm, yields, a, &soft);
+        const mpm_vec one = mpm_splat(1);
+        const mpm_vec back =
+            mpm_select(yields, c->residual + soft, one) / mpm_select(yields, norm, one);
+        mpm_vec elastic[6], flowed[6];
+        for (int k = 0; k < MPM_SYM(dim); k++) {
+            e[k] *= back;
+            elastic[k] = k < 3 ? e[k] + mean : e[k];
+        }
+        mpm_exp_twice(elastic, flowed, dim);
+        for (int k = 0; k < MPM_SYM(dim); k++) {
+            b[k] = mpm_select(yields, flowed[k], b[k]);
+        }
+    }
+    const mpm_vec r = mpm_exp(-trace);
+    for (int k = 0; k < MPM_SYM(dim); k++) {
+        sigma[k] = r * (k < 3 ? c->two_mu * e[k] + c->K * trace : c->two_mu * e[k]);
+    }
+}
+
+#ifndef MPM_LAW_ONLY
+#include "server/mpm/material_spans.h"
 
 enum { DENSITY, YOUNGS_MODULUS, POISSON_RATIO, YIELD_STRENGTH, RESIDUAL_STRENGTH, SOFTENING };
 
@@ -69,63 +139,15 @@ static int conflict(const double *par, const char **why) {
     return -1;
 }
 
-// Plastic multiplier |d eps_p| of the radial return from |dev tau| = norm, and the new yield
-// radius. g(x) = norm - 2 mu x - sqrt(2/3) sigma_y(a + sqrt(2/3) x) is concave and falling, so
-// Newton's iterates come down to the root from above after the first.
-static double plastic_multiplier(const double *par, double norm, double a, double *radius) {
-    const double root = sqrt(2.0 / 3), two_mu = 2 * shear_modulus(par);
-    const double residual = residual_strength(par), fall = par[YIELD_STRENGTH] - residual;
-    double x = 0;
-    for (int k = 0; k < 50; k++) { // quadratic: 2 where nothing softens, else 3 or 4 in practice
-        const double soft = fall * exp(-par[SOFTENING] * (a + root * x));
-        *radius = root * (residual + soft);
-        const double step =
-            (norm - two_mu * x - *radius) / (two_mu - 2.0 / 3 * par[SOFTENING] * soft);
-        x += step;
-        if (fabs(step) <= 4 * DBL_EPSILON * norm / two_mu) { // round-off of the residual
-            break;
-        }
-    }
-    return x;
+static void prepare(const double *par, void *constants) {
+    struct hencky_j2 *c = constants;
+    c->two_mu = 2 * shear_modulus(par);
+    c->K = bulk_modulus(par);
+    c->residual = sqrt(2.0 / 3) * residual_strength(par);
+    c->fall = sqrt(2.0 / 3) * (par[YIELD_STRENGTH] - residual_strength(par));
+    c->softening = par[SOFTENING];
 }
-
-MPM_KERNEL void stress(struct mpm_particles *s, size_t begin, size_t end, const int dim) {
-    const double *par = s->parameters;
-    const double two_mu = 2 * shear_modulus(par), K = bulk_modulus(par), root = sqrt(2.0 / 3);
-    const double residual = residual_strength(par), fall = par[YIELD_STRENGTH] - residual;
-    for (size_t p = begin; p < end; p++) {
-        double b[6], e[6], norm2 = 0;
-        for (int k = 0; k < MPM_SYM(dim); k++) {
-            b[k] = s->b[mpm_at(p, MPM_SYM(dim), k)];
-        }
-        mpm_half_log(b, e, dim);
-        const double trace = e[0] + e[1] + e[2];
-        for (int k = 0; k < MPM_SYM(dim); k++) {
-            e[k] -= k < 3 ? trace / 3 : 0;
-            norm2 += (k < 3 ? 1 : 2) * e[k] * e[k];
-        }
-        const double norm = two_mu * sqrt(norm2), a = s->plastic_strain[p];
-        double radius = root * (residual + (fall > 0 ? fall * exp(-par[SOFTENING] * a) : 0));
-        if (norm > radius) {
-            s->plastic_strain[p] = a + root * plastic_multiplier(par, norm, a, &radius);
-            const double back = radius / norm;
-            double elastic[6];
-            for (int k = 0; k < MPM_SYM(dim); k++) {
-                e[k] *= back;
-                elastic[k] = e[k] + (k < 3 ? trace / 3 : 0);
-            }
-            mpm_exp_twice(elastic, b, dim);
-            for (int k = 0; k < MPM_SYM(dim); k++) {
-                s->b[mpm_at(p, MPM_SYM(dim), k)] = b[k];
-            }
-        }
-        const double r = exp(-trace);
-        for (int k = 0; k < MPM_SYM(dim); k++) {
-            s->sigma[mpm_at(p, MPM_SYM(dim), k)] = r * (two_mu * e[k] + (k < 3 ? K * trace : 0));
-        }
-    }
-}
-MPM_STRESS_2D_3D(stress)
+MPM_SPANS_KEEPS_B(hencky_j2)
 
 // mu |dev eps|^2 + K/2 (tr eps)^2, with eps from the stress.
 static double energy(const struct mpm_particles *s, size_t p) {
@@ -150,6 +172,8 @@ const struct mpm_material mpm_material_hencky_j2 = {
     .plastic = true,
     .conflict = conflict,
     .wave_speed = wave_speed,
+    .prepare = prepare,
     .stress = {stress_2d, stress_3d},
     .energy = energy,
 };
+#endif

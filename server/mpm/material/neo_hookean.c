@@ -1,8 +1,29 @@
 // Compressible Neo-Hookean solid: psi = mu/2 (tr b - 3) - mu ln J + lambda/2 (ln J)^2,
 // sigma = [mu (b - 1) + lambda ln J 1] / J with b = F F^T, and F33 = 1 in plane strain.
-#include <float.h>
+#include "server/mpm/tensor.h"
 
-#include "server/mpm/particles.h"
+struct neo_hookean {
+    double mu, lambda; // Pa
+};
+
+MPM_KERNEL void neo_hookean_stress(const struct neo_hookean *c, const mpm_vec *F, mpm_vec *sigma,
+                                   const int dim) {
+    const mpm_vec J = mpm_det(F, dim), r = 1.0 / J, pressure_part = c->lambda * mpm_log(J);
+    for (int k = 0; k < MPM_SYM(dim); k++) {
+        const int i = mpm_sym_row(k), j = mpm_sym_column(k);
+        mpm_vec b = mpm_splat(i == j); // b33 = 1 in plane strain
+        if (i < dim && j < dim) {
+            b = F[i * dim] * F[j * dim];
+            for (int d = 1; d < dim; d++) {
+                b += F[i * dim + d] * F[j * dim + d];
+            }
+        }
+        sigma[k] = r * (i == j ? c->mu * (b - 1.0) + pressure_part : c->mu * b);
+    }
+}
+
+#ifndef MPM_LAW_ONLY
+#include "server/mpm/material_spans.h"
 
 enum { DENSITY, YOUNGS_MODULUS, POISSON_RATIO };
 
@@ -26,29 +47,12 @@ static double wave_speed(const double *par) {
     return sqrt((lame_lambda(par) + 2 * shear_modulus(par)) / par[DENSITY]);
 }
 
-MPM_KERNEL void stress(struct mpm_particles *s, size_t begin, size_t end, const int dim) {
-    const double mu = shear_modulus(s->parameters), lambda = lame_lambda(s->parameters);
-    for (size_t p = begin; p < end; p++) {
-        double F[9];
-        for (int k = 0; k < dim * dim; k++) {
-            F[k] = s->F[mpm_at(p, dim * dim, k)];
-        }
-        const double J = mpm_det(F, dim), r = 1 / J, pressure_part = lambda * log(J);
-        for (int k = 0; k < MPM_SYM(dim); k++) {
-            const int i = mpm_sym_row(k), j = mpm_sym_column(k);
-            double b = i == j; // b33 = 1 in plane strain
-            if (i < dim && j < dim) {
-                b = 0;
-                for (int d = 0; d < dim; d++) {
-                    b += F[i * dim + d] * F[j * dim + d];
-                }
-            }
-            const double tau = i == j ? mu * (b - 1) + pressure_part : mu * b;
-            s->sigma[mpm_at(p, MPM_SYM(dim), k)] = r * tau;
-        }
-    }
+static void prepare(const double *par, void *constants) {
+    struct neo_hookean *c = constants;
+    c->mu = shear_modulus(par);
+    c->lambda = lame_lambda(par);
 }
-MPM_STRESS_2D_3D(stress)
+MPM_SPANS_KEEPS_F(neo_hookean)
 
 static double energy(const struct mpm_particles *s, size_t p) {
     const double mu = shear_modulus(s->parameters), lambda = lame_lambda(s->parameters);
@@ -69,6 +73,8 @@ const struct mpm_material mpm_material_neo_hookean = {
     .kinematics = MPM_KEEPS_F,
     .parameters = parameters,
     .wave_speed = wave_speed,
+    .prepare = prepare,
     .stress = {stress_2d, stress_3d},
     .energy = energy,
 };
+#endif

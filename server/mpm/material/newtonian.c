@@ -1,8 +1,39 @@
 // Nearly incompressible Newtonian fluid: sigma = -p 1 + 2 mu dev(d), p = -K (J - 1), d = sym(L).
 // Keeps no deformation but the volume ratio.
-#include <float.h>
+#include "server/mpm/tensor.h"
 
-#include "server/mpm/particles.h"
+struct newtonian {
+    double K, mu; // Pa, Pa s
+};
+
+// The mean of dev(d) is 0, so the mean stress is -p whatever the rate part holds.
+MPM_KERNEL void newtonian_stress(const struct newtonian *c, mpm_vec J, mpm_vec *sigma,
+                                 const int dim) {
+    (void)dim;
+    const mpm_vec minus_p = c->K * (J - 1.0);
+    for (int k = 0; k < 3; k++) {
+        sigma[k] += minus_p;
+    }
+}
+
+MPM_KERNEL void newtonian_rate(const struct newtonian *c, const mpm_vec *L, mpm_vec *sigma,
+                               const int dim) {
+    mpm_vec trace = mpm_splat(0);
+    for (int d = 0; d < dim; d++) {
+        trace += L[d * dim + d];
+    }
+    for (int k = 0; k < MPM_SYM(dim); k++) {
+        const int i = mpm_sym_row(k), j = mpm_sym_column(k);
+        mpm_vec twice_d = mpm_splat(0);
+        if (i < dim && j < dim) {
+            twice_d = L[i * dim + j] + L[j * dim + i];
+        }
+        sigma[k] = c->mu * (i == j ? twice_d - 2.0 / 3 * trace : twice_d);
+    }
+}
+
+#ifndef MPM_LAW_ONLY
+#include "server/mpm/material_spans.h"
 
 enum { DENSITY, BULK_MODULUS, VISCOSITY };
 
@@ -32,44 +63,12 @@ static double diffusivity(const double *par) {
     return par[VISCOSITY] / par[DENSITY];
 }
 
-// The mean of dev(d) is 0, so the mean stress is -p whatever the rate part holds.
-MPM_KERNEL void stress(struct mpm_particles *s, size_t begin, size_t end, const int dim) {
-    const double K = s->parameters[BULK_MODULUS];
-    for (size_t p = begin; p < end; p++) {
-        const double minus_p = K * (s->Jbar[p] - 1);
-        for (int k = 0; k < 3; k++) {
-            s->sigma[mpm_at(p, MPM_SYM(dim), k)] += minus_p;
-        }
-    }
+static void prepare(const double *par, void *constants) {
+    struct newtonian *c = constants;
+    c->K = par[BULK_MODULUS];
+    c->mu = par[VISCOSITY];
 }
-MPM_STRESS_2D_3D(stress)
-
-MPM_KERNEL void rate_stress(struct mpm_particles *s, size_t begin, size_t end, double (*L)[9],
-                            const int dim) {
-    const double mu = s->parameters[VISCOSITY];
-    for (size_t p = begin; p < end; p++) {
-        const double *l = L[p - begin];
-        double trace = 0;
-        for (int d = 0; d < dim; d++) {
-            trace += l[d * dim + d];
-        }
-        for (int k = 0; k < MPM_SYM(dim); k++) {
-            const int i = mpm_sym_row(k), j = mpm_sym_column(k);
-            double twice_d = i < dim && j < dim ? l[i * dim + j] + l[j * dim + i] : 0;
-            if (i == j) {
-                twice_d -= 2.0 / 3 * trace;
-            }
-            s->sigma[mpm_at(p, MPM_SYM(dim), k)] = mu * twice_d;
-        }
-    }
-}
-
-static void rate_stress_2d(struct mpm_particles *s, size_t begin, size_t end, double (*L)[9]) {
-    rate_stress(s, begin, end, L, 2);
-}
-static void rate_stress_3d(struct mpm_particles *s, size_t begin, size_t end, double (*L)[9]) {
-    rate_stress(s, begin, end, L, 3);
-}
+MPM_SPANS_KEEPS_J(newtonian)
 
 static double energy(const struct mpm_particles *s, size_t p) {
     const double e = s->Jbar[p] - 1;
@@ -84,7 +83,9 @@ const struct mpm_material mpm_material_newtonian = {
     .parameters = parameters,
     .wave_speed = wave_speed,
     .diffusivity = diffusivity,
+    .prepare = prepare,
     .stress = {stress_2d, stress_3d},
     .rate_stress = {rate_stress_2d, rate_stress_3d},
     .energy = energy,
 };
+#endif

@@ -1,0 +1,286 @@
+// Sorting of particles by cell: radix sort of their keys, then one field at a time changes places.
+#include "server/mpm/order.h"
+
+#include <stdlib.h>
+#include <string.h>
+
+#include "server/mpm/basis.h"
+
+#define DIGIT 11 // bits of one pass of the radix sort: its counters fit the first-level cache
+#define N_DIGITS (1 << DIGIT)
+
+static size_t numbers_bytes(size_t n) {
+    return (n * sizeof(uint32_t) + 63) / 64 * 64;
+}
+
+size_t mpm_sorter_bytes(size_t n, int n_threads) {
+    return 4 * numbers_bytes(n) + (size_t)n_threads * N_DIGITS * sizeof(uint32_t);
+}
+
+bool mpm_sorter_create(struct mpm_sorter *sorter, size_t n, int n_threads) {
+    *sorter = (struct mpm_sorter){.n_threads = n_threads, .bytes = mpm_sorter_bytes(n, n_threads)};
+    char *memory = aligned_alloc(64, sorter->bytes);
+    if (!memory) {
+        return false;
+    }
+    uint32_t **const arrays[] = {&sorter->key[0], &sorter->key[1], &sorter->from[0],
+                                 &sorter->from[1], &sorter->count};
+    for (size_t k = 0; k < 5; k++) {
+        *arrays[k] = (uint32_t *)(void *)(memory + k * numbers_bytes(n));
+    }
+    return true;
+}
+
+void mpm_sorter_free(struct mpm_sorter *sorter) {
+    free(sorter->key[0]);
+    *sorter = (struct mpm_sorter){0};
+}
+
+void mpm_order_free(struct mpm_order *order) {
+    free(order->tile);
+    free(order->by_colour);
+    *order = (struct mpm_order){0};
+}
+
+bool mpm_order_reserve(struct mpm_order *order, size_t n) {
+    if (n <= order->capacity) {
+        return true;
+    }
+    const size_t capacity = n + n / 2 + 8;
+    struct mpm_tile *tile = realloc(order->tile, capacity * sizeof *tile);
+    order->tile = tile ? tile : order->tile;
+    uint32_t *by_colour = realloc(order->by_colour, capacity * sizeof *by_colour);
+    order->by_colour = by_colour ? by_colour : order->by_colour;
+    if (tile && by_colour) {
+        order->capacity = capacity;
+    }
+    return tile && by_colour;
+}
+
+// The part of n that part k of n_parts takes.
+static size_t part_begin(size_t n, int k, int n_parts) {
+    return n * (size_t)k / (size_t)n_parts;
+}
+
+static void find_keys(const struct mpm_particles *s, const struct mpm_grid *g, enum mpm_basis basis,
+                      uint32_t *key, int n_threads) {
+    (void)n_threads; // without OpenMP
+#pragma omp parallel for schedule(static) num_threads(n_threads) if (n_threads > 1)
+    for (size_t p = 0; p < s->n; p++) {
+        int base[MPM_MAX_DIM];
+        for (int d = 0; d < g->dim; d++) {
+            base[d] =
+                mpm_base(basis, (s->x[mpm_at(p, g->dim, d)] - g->origin[d]) * g->inv_h, s->half);
+        }
+        key[p] = g->dim == 2 ? mpm_cell_key(g, base, 2) : mpm_cell_key(g, base, 3);
+    }
+}
+
+// One stable pass by the digit at `shift`, in parts that count and then move by themselves; the
+// outcome does not depend on their number.
+static void radix_pass(struct mpm_sorter *sorter, int turn, bool first, size_t n, uint32_t least,
+                       int shift) {
+    const uint32_t *key = sorter->key[turn], *from = sorter->from[turn];
+    uint32_t *key_out = sorter->key[!turn], *from_out = sorter->from[!turn];
+    const int n_parts = sorter->n_threads;
+    uint32_t(*const count)[N_DIGITS] = (uint32_t(*)[N_DIGITS])(void *)sorter->count;
+    memset(count, 0, (size_t)n_parts * sizeof *count);
+#pragma omp parallel for schedule(static) num_threads(n_parts) if (n_parts > 1)
+    for (int k = 0; k < n_parts; k++) {
+        for (size_t i = part_begin(n, k, n_parts); i < part_begin(n, k + 1, n_parts); i++) {
+            count[k][(key[i] - least) >> shift & (N_DIGITS - 1)]++;
+        }
+    }
+    uint32_t sum = 0;
+    for (int digit = 0; digit < N_DIGITS; digit++) {
+        for (int k = 0; k < n_parts; k++) {
+            const uint32_t c = count[k][digit];
+            count[k][digit] = sum;
+            sum += c;
+        }
+    }
+#pragma omp parallel for schedule(static) num_threads(n_parts) if (n_parts > 1)
+    for (int k = 0; k < n_parts; k++) {
+        for (size_t i = part_begin(n, k, n_parts); i < part_begin(n, k + 1, n_parts); i++) {
+            const uint32_t to = count[k][(key[i] - least) >> shift & (N_DIGITS - 1)]++;
+            key_out[to] = key[i];
+            from_out[to] = first ? (uint32_t)i : from[i];
+        }
+    }
+}
+
+struct moving {
+    const uint32_t *from;
+    double *room;
+    size_t n;
+    int n_threads;
+};
+
+static void move_field(void *context, double *field, int components) {
+    const struct moving *m = context;
+    const size_t n = m->n;
+    for (int c = 0; c < components; c++) {
+#pragma omp parallel num_threads(m->n_threads) if (m->n_threads > 1)
+        {
+#pragma omp for schedule(static)
+            for (size_t p = 0; p < n; p++) {
+                m->room[p] = field[mpm_at(m->from[p], components, c)];
+            }
+#pragma omp for schedule(static)
+            for (size_t p = 0; p < n; p++) {
+                field[mpm_at(p, components, c)] = m->room[p];
+            }
+        }
+    }
+}
+
+static void move_particles(struct mpm_particles *s, const uint32_t *from,
+                           struct mpm_sorter *sorter) {
+    // Both arrays of keys lie together: room for n doubles.
+    struct moving m = {.from = from,
+                       .room = (double *)(void *)sorter->key[0],
+                       .n = s->n,
+                       .n_threads = sorter->n_threads};
+    mpm_particles_each(s, move_field, &m);
+    uint32_t *ids = sorter->key[0];
+    for (size_t p = 0; p < s->n; p++) {
+        ids[p] = s->id[from[p]];
+    }
+    memcpy(s->id, ids, s->n * sizeof *ids);
+    for (size_t p = 0; s->at && p < s->n; p++) {
+        s->at[s->id[p]] = (uint32_t)p;
+    }
+}
+
+static bool find_tiles(struct mpm_order *order, const struct mpm_grid *g, const uint32_t *key,
+                       size_t n) {
+    const int bits = MPM_BLOCK_BITS(g->dim);
+    order->n_tiles = 0;
+    for (size_t p = 0; p < n;) {
+        struct mpm_tile tile = {.begin = (uint32_t)p, .block = key[p] >> bits};
+        for (; p < n && key[p] >> bits == tile.block; p++) {
+            tile.cells |= (uint64_t)1 << (key[p] & ((1u << bits) - 1));
+        }
+        tile.end = (uint32_t)p;
+        if (!mpm_order_reserve(order, order->n_tiles + 1)) {
+            return false;
+        }
+        order->tile[order->n_tiles++] = tile;
+    }
+    return true;
+}
+
+bool mpm_order_sort(struct mpm_order *order, struct mpm_particles *s, const struct mpm_grid *grid,
+                    enum mpm_basis basis, struct mpm_sorter *sorter) {
+    const size_t n = s->n;
+    uint32_t *key = sorter->key[0];
+    find_keys(s, grid, basis, key, sorter->n_threads);
+    uint32_t least = UINT32_MAX, most = 0;
+    bool sorted = true;
+    for (size_t p = 0; p < n; p++) {
+        sorted &= p == 0 || key[p] >= key[p - 1];
+        least = key[p] < least ? key[p] : least;
+        most = key[p] > most ? key[p] : most;
+    }
+    if (sorted) {
+        return find_tiles(order, grid, key, n);
+    }
+    int turn = 0;
+    for (int shift = 0; shift < 32 && (most - least) >> shift > 0; shift += DIGIT, turn ^= 1) {
+        radix_pass(sorter, turn, shift == 0, n, least, shift);
+    }
+    const bool found = find_tiles(order, grid, sorter->key[turn], n);
+    move_particles(s, sorter->from[turn], sorter);
+    return found;
+}
+
+// Tiles of one colour are two blocks apart, of cubic B-splines three: a stencil of 3 nodes, from
+// one cell before the block to one behind it, ends in the second node of the next block; one of 4
+// would meet what comes from the block after that.
+static int colours_along(enum mpm_basis basis) {
+    return basis == MPM_BSPLINE3 ? 3 : 2;
+}
+
+void mpm_order_colour(struct mpm_order *order, const struct mpm_grid *grid, enum mpm_basis basis) {
+    const int along = colours_along(basis);
+    order->n_colours = grid->dim == 2 ? along * along : along * along * along;
+    size_t n = 0;
+    for (int colour = 0; colour < order->n_colours; colour++) {
+        order->colour_begin[colour] = n;
+        for (size_t k = 0; k < order->n_tiles; k++) {
+            int place[MPM_MAX_DIM], its = 0;
+            mpm_grid_block_place(grid, order->tile[k].block, place);
+            for (int d = 0; d < grid->dim; d++) {
+                its = its * along + place[d] % along;
+            }
+            if (its == colour) {
+                order->by_colour[n++] = (uint32_t)k;
+            }
+        }
+    }
+    order->colour_begin[order->n_colours] = n;
+}
+
+// The nodes that a particle of a cell can reach while it drifts by less than a cell are
+// base - 1 .. base + support along each direction. As bits: which of the 3^dim blocks around its
+// own they touch.
+static uint32_t blocks_near(int cell, int support, int dim) {
+    uint32_t near = 1;
+    for (int d = 0; d < dim; d++) {
+        const int base = cell >> 2 * (dim - 1 - d) & 3;
+        const bool touched[3] = {base == 0, true, base + support >= MPM_EDGE};
+        uint32_t wider = 0;
+        for (uint32_t at = 0; at < 27; at++) {
+            for (uint32_t k = 0; near >> at & 1 && k < 3; k++) {
+                wider |= (uint32_t)touched[k] << (at * 3 + k);
+            }
+        }
+        near = wider;
+    }
+    return near;
+}
+
+static bool activate(struct mpm_grid *grid, uint32_t block, uint32_t near) {
+    int place[MPM_MAX_DIM] = {0}, at[MPM_MAX_DIM] = {0};
+    mpm_grid_block_place(grid, block, place);
+    for (int k = 0; k < (grid->dim == 2 ? 9 : 27); k++) {
+        for (int d = grid->dim, rest = k; d-- > 0; rest /= 3) {
+            at[d] = place[d] + rest % 3 - 1;
+        }
+        if (near >> k & 1 && !mpm_grid_activate(grid, at)) {
+            return false;
+        }
+    }
+    return true;
+}
+
+bool mpm_order_activate(const struct mpm_order *order, struct mpm_grid *grid,
+                        enum mpm_basis basis) {
+    uint32_t near[MPM_MAX_STENCIL] = {0};
+    for (int cell = 0; cell < MPM_BLOCK_NODES(grid->dim); cell++) {
+        near[cell] = blocks_near(cell, mpm_support(basis), grid->dim);
+    }
+    for (size_t k = 0; k < order->n_tiles; k++) {
+        const struct mpm_tile *tile = &order->tile[k];
+        uint32_t all = 0;
+        for (int cell = 0; cell < MPM_BLOCK_NODES(grid->dim); cell++) {
+            all |= tile->cells >> cell & 1 ? near[cell] : 0;
+        }
+        if (!activate(grid, tile->block, all)) {
+            return false;
+        }
+    }
+    return true;
+}
+
+bool mpm_activate_around(struct mpm_grid *grid, enum mpm_basis basis, const double *x,
+                         double half) {
+    int base[MPM_MAX_DIM];
+    for (int d = 0; d < grid->dim; d++) {
+        base[d] = mpm_base(basis, (x[d] - grid->origin[d]) * grid->inv_h, half);
+    }
+    const uint32_t key = grid->dim == 2 ? mpm_cell_key(grid, base, 2) : mpm_cell_key(grid, base, 3);
+    const int cell = (int)(key & (uint32_t)(MPM_BLOCK_NODES(grid->dim) - 1));
+    return activate(grid, key >> MPM_BLOCK_BITS(grid->dim),
+                    blocks_near(cell, mpm_support(basis), grid->dim));
+}
