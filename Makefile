@@ -52,6 +52,7 @@ PROTO_SRC = $(sort $(wildcard proto/*.c))
 SERVER_SRC = $(sort $(wildcard server/*.c))
 CLIENT_SRC = $(sort $(wildcard client/*.c))
 SCENES = $(sort $(wildcard scenes/*.json))
+TABLES = $(sort $(wildcard scenes/reference/*.csv))
 
 obj = $(patsubst %.c,$(B)/obj/%.o,$(1))
 
@@ -106,21 +107,28 @@ $(B)/obj/%.$(1).o: %.c Makefile
 endef
 $(foreach level,$(LEVELS),$(eval $(call lanes_rule,$(level))))
 
-# The built-in scenes, embedded as they are.
+# The built-in scenes and the tables that they cite, embedded as they are: $(1) files, $(2) name of the list,
+# $(3) their ending.
+embed = $(Q){ echo '\#include "server/scenes_data.h"'; i=0; \
+	for f in $(1); do echo "static const char text_$$i[] = {"; i=$$((i + 1)); \
+	od -An -v -tx1 $$f | sed 's/ \([0-9a-f][0-9a-f]\)/0x\1,/g'; echo "0};"; done; \
+	echo "const struct scenes_data $(2)[] = {"; i=0; \
+	for f in $(1); do echo "{\"$$(basename $$f $(3))\", text_$$i, sizeof text_$$i - 1},"; i=$$((i + 1)); done; \
+	echo "{0, 0, 0}};"; } > $@
 $(B)/gen/scenes_data.c: $(SCENES) Makefile
 	$(call say,EMBED,scenes)
 	@mkdir -p $(@D)
-	$(Q){ echo '#include "server/scenes_data.h"'; \
-	for f in $(SCENES); do n=$$(basename $$f .json | tr - _); echo "static const char text_$$n[] = {"; \
-	od -An -v -tx1 $$f | sed 's/ \([0-9a-f][0-9a-f]\)/0x\1,/g'; echo "0};"; done; \
-	echo "const struct scenes_data scenes_data[] = {"; \
-	for f in $(SCENES); do n=$$(basename $$f .json); echo "{\"$$n\", text_$$(echo $$n | tr - _), sizeof text_$$(echo $$n | tr - _) - 1},"; done; \
-	echo "{0, 0, 0}};"; } > $@
-$(B)/obj/gen/scenes_data.o: $(B)/gen/scenes_data.c
+	$(call embed,$(SCENES),scenes_data,.json)
+$(B)/gen/tables_data.c: $(TABLES) Makefile
+	$(call say,EMBED,tables)
+	@mkdir -p $(@D)
+	$(call embed,$(TABLES),tables_data,.csv)
+GEN_OBJ = $(B)/obj/gen/scenes_data.o $(B)/obj/gen/tables_data.o
+$(GEN_OBJ): $(B)/obj/gen/%.o: $(B)/gen/%.c
 	@mkdir -p $(@D)
 	$(Q)$(CC) $(ALL_CFLAGS) -c $< -o $@
 
-SERVER_OBJ = $(filter-out %/main.o,$(call obj,$(SERVER_SRC))) $(B)/obj/gen/scenes_data.o
+SERVER_OBJ = $(filter-out %/main.o,$(call obj,$(SERVER_SRC))) $(GEN_OBJ)
 $(B)/fbard: $(call obj,server/main.c) $(SERVER_OBJ) $(call obj,$(PROTO_SRC)) $(B)/libmpm.a
 	$(call say,LD,$@)
 	$(Q)$(CC) $(ALL_LDFLAGS) -pthread $(OPENMP) $^ $(call pc_libs,$(SERVER_LIBS)) -lm -o $@

@@ -25,6 +25,8 @@ static double number_of(const cJSON *object, const char *key, double otherwise) 
 
 static const char *unit_of(const cJSON *probe, const struct store_plan *plan) {
     const char *kind = text_of(probe, "kind"), *field = text_of(probe, "field");
+    if (strcmp(kind, "error") == 0 && strcmp(text_of(probe, "norm"), "absolute") != 0)
+        return "1";
     for (size_t i = 0; i < sizeof kinds / sizeof *kinds; i++)
         if (strcmp(kinds[i].kind, kind) == 0)
             return kinds[i].unit[plan->dimension == 3];
@@ -40,6 +42,13 @@ static void append(char *line, size_t bytes, const char *before, const char *tex
         snprintf(line + n, bytes - n, "%s%s", before, text);
 }
 
+// What an error is held against: a table's name, or a solution, whose only key is its name.
+static const char *against_of(const cJSON *probe) {
+    const cJSON *against = cJSON_GetObjectItemCaseSensitive(probe, "against");
+    return cJSON_IsObject(against) && against->child ? against->child->string
+                                                     : text_of(probe, "against");
+}
+
 static void describe(const cJSON *probe, double scale, char *out, size_t bytes) {
     char number[48];
     const double average = number_of(probe, "average", 0);
@@ -49,6 +58,8 @@ static void describe(const cJSON *probe, double scale, char *out, size_t bytes) 
     append(out, bytes, " along ", text_of(probe, "axis"));
     if (*text_of(probe, "axis"))
         append(out, bytes, ", ", text_of(probe, "side"));
+    append(out, bytes, " against ", against_of(probe));
+    append(out, bytes, ", norm ", text_of(probe, "norm"));
     append(out, bytes, ", body ", text_of(probe, "body"));
     append(out, bytes, ", wall ", text_of(probe, "wall"));
     if (average > 0) {

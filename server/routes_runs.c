@@ -38,7 +38,9 @@ static cJSON *accuracy_json(struct run *run, const struct run_status *status) {
             reply_add(item, "at", r->at);
         reply_add(item, "value", value);
         reply_add(item, "reference", r->value);
-        reply_add(item, "relative_error", fabs(value - r->value) / fabs(r->value));
+        // Of a reference of 0, as an error's is: how far from it.
+        const double size = r->value != 0 ? fabs(r->value) : 1;
+        reply_add(item, "relative_error", fabs(value - r->value) / size);
         reply_add(item, "tolerance", r->tolerance);
         cJSON_AddStringToObject(item, "source", r->source);
         cJSON_AddItemToArray(list, item);

@@ -9,6 +9,7 @@
 
 #include "server/scene_check.h"
 #include "server/scene_keys.h"
+#include "server/scene_tables.h"
 #include "server/scenes_data.h"
 
 // All arrays of a definition, freed together.
@@ -56,6 +57,12 @@ static void numbers(const cJSON *array, double out[MPM_MAX_DIM]) {
 
 static void vector(const cJSON *object, const char *key, double out[MPM_MAX_DIM]) {
     numbers(json_member(object, key), out);
+}
+
+static void unit_length(double v[MPM_MAX_DIM]) {
+    double length = hypot(hypot(v[0], v[1]), v[2]);
+    for (int d = 0; d < MPM_MAX_DIM && length > 0; d++)
+        v[d] /= length;
 }
 
 static int axis(const cJSON *object, const char *key) {
@@ -225,6 +232,39 @@ static bool read_shape(struct scene *scene, const cJSON *json, struct mpm_shape 
     return true;
 }
 
+// {KIND: {...}}: which members a kind has is the table of keys' matter.
+static void read_solution(const cJSON *json, struct mpm_solution *q) {
+    const cJSON *form = json->child;
+    q->kind = (enum mpm_solution_kind)mpm_solution_parse(form->string);
+    vector(form, "center", q->centre);
+    vector(form, "axis", q->vector);
+    unit_length(q->vector);
+    q->axis = axis(form, "axis");
+    q->number = (int)number(form, "number");
+    q->from = number(form, json_member(form, "gate") ? "gate" : "from");
+    q->length = number(form, json_member(form, "wavelength") ? "wavelength"
+                             : json_member(form, "depth")    ? "depth"
+                                                             : "length");
+    q->inner = number(form, "inner");
+    q->outer = number(form, "outer");
+    q->amplitude = number(form, json_member(form, "speed") ? "speed" : "amplitude");
+    q->rate = number(form, "rate");
+    q->period = number(form, "period");
+    q->pressure = number(form, "pressure");
+}
+
+static void read_body_force(const cJSON *json, struct mpm_body_force_def *force) {
+    if (cJSON_IsArray(json)) {
+        numbers(json, force->vector);
+        for (int d = 0; d < MPM_MAX_DIM; d++)
+            if (force->vector[d] != 0)
+                force->kind = MPM_BODY_FORCE_UNIFORM;
+    } else if (cJSON_IsObject(json)) {
+        force->kind = MPM_BODY_FORCE_SOLUTION;
+        read_solution(json, &force->solution);
+    }
+}
+
 static void read_velocity(const cJSON *json, struct mpm_velocity *velocity) {
     const cJSON *form = json->child;
     if (cJSON_IsArray(json)) {
@@ -235,9 +275,10 @@ static void read_velocity(const cJSON *json, struct mpm_velocity *velocity) {
         vector(form, "center", velocity->centre);
         velocity->rate = number(form, "rate");
         vector(form, "axis", velocity->vector);
-        double length = hypot(hypot(velocity->vector[0], velocity->vector[1]), velocity->vector[2]);
-        for (int d = 0; d < MPM_MAX_DIM && length > 0; d++)
-            velocity->vector[d] /= length;
+        unit_length(velocity->vector);
+    } else if (strcmp(form->string, "mode") != 0) {
+        velocity->kind = MPM_VELOCITY_SOLUTION;
+        read_solution(json, &velocity->solution);
     } else {
         velocity->kind = MPM_VELOCITY_MODE;
         velocity->axis = axis(form, "axis");
@@ -294,6 +335,20 @@ static bool read_walls(struct scene *scene) {
     return true;
 }
 
+static void read_select(const cJSON *select, struct mpm_load_def *load) {
+    const cJSON *box = json_member(select, "box");
+    const char *extreme = text(select, "extreme");
+    load->has_box = box != NULL;
+    vector(box, "min", load->box_min);
+    vector(box, "max", load->box_max);
+    if (!box) {
+        load->max_side = extreme[0] == '+';
+        load->round = extreme[1] == 'r';
+        load->axis = load->round ? axis(select, "axis") : extreme[1] - 'x';
+        vector(select, "center", load->centre);
+    }
+}
+
 static bool read_loads(struct scene *scene) {
     const cJSON *map = json_member(scene->json, "loads");
     const cJSON *bodies = json_member(scene->json, "bodies");
@@ -303,19 +358,9 @@ static bool read_loads(struct scene *scene) {
         return false;
     for (const cJSON *json = map->child; json; json = json->next) {
         struct mpm_load_def *load = &loads[def->n_loads++];
-        const cJSON *select = json_member(json, "select"), *box = json_member(select, "box");
-        const char *extreme = text(select, "extreme");
         load->name = json->string;
         load->body = index_of(bodies, text(json, "body"));
-        load->has_box = box != NULL;
-        vector(box, "min", load->box_min);
-        vector(box, "max", load->box_max);
-        if (!box) {
-            load->max_side = extreme[0] == '+';
-            load->round = extreme[1] == 'r';
-            load->axis = load->round ? axis(select, "axis") : extreme[1] - 'x';
-            vector(select, "center", load->centre);
-        }
+        read_select(json_member(json, "select"), load);
         load->is_pressure = json_member(json, "pressure") != NULL;
         vector(json, "force", load->force);
         load->pressure = number(json, "pressure");
@@ -468,6 +513,62 @@ static bool read_stages(struct scene *scene) {
     return true;
 }
 
+// A table's positions and values, as far as the scene has those coordinates.
+static bool read_table(struct scene *scene, const char *name, struct mpm_probe_def *probe) {
+    struct mpm_against *against = &probe->against;
+    struct scene_table table;
+    const int dimension = scene->def.dimension;
+    int places[MPM_MAX_DIM], columns[MPM_MAX_COMPONENTS];
+    const int width = probe->component >= 0
+                          ? 1
+                          : (int)mpm_field_components((enum mpm_field)probe->field, dimension);
+    char lacks[40];
+    if (!scene_table_read(name, &table))
+        return false;
+    against->is_table = true;
+    against->n = table.n_rows;
+    for (int d = 0; d < dimension; d++) {
+        const int column = scene_table_column(&table, (const char[2]){(char)('X' + d), 0});
+        if (column >= 0) {
+            places[against->n_axes] = column;
+            against->axis[against->n_axes++] = d;
+        }
+    }
+    scene_table_field(&table, (enum mpm_field)probe->field, probe->component, dimension, columns,
+                      lacks);
+    double *points = array(scene, table.n_rows * (size_t)against->n_axes, sizeof *points);
+    double *values = array(scene, table.n_rows * (size_t)width, sizeof *values);
+    against->points = points;
+    against->values = values;
+    for (size_t k = 0; k < table.n_rows && points && values; k++) {
+        const double *row = table.values + k * table.n_columns;
+        for (int d = 0; d < against->n_axes; d++)
+            *points++ = row[places[d]];
+        for (int c = 0; c < width; c++)
+            *values++ = row[columns[c]];
+    }
+    scene_table_free(&table);
+    return against->points && against->values;
+}
+
+static bool read_error(struct scene *scene, const cJSON *json, struct mpm_probe_def *probe) {
+    const cJSON *against = json_member(json, "against"), *exclude = json_member(json, "exclude");
+    const char *name;
+    probe->norm = (enum mpm_norm)mpm_norm_parse(text(json, "norm"));
+    probe->component = -1;
+    for (int c = 0;
+         (name = scene_field_component((enum mpm_field)probe->field, scene->def.dimension, c)); c++)
+        if (*name && text_is(json, "component", name))
+            probe->component = c;
+    if (exclude && !read_shape(scene, exclude, &probe->exclude))
+        return false;
+    probe->has_exclude = exclude != NULL;
+    if (cJSON_IsString(against))
+        return read_table(scene, against->valuestring, probe);
+    read_solution(against, &probe->against.solution);
+    return true;
+}
+
 static bool read_probes(struct scene *scene) {
     const cJSON *map = json_member(scene->json, "probes");
     const cJSON *bodies = json_member(scene->json, "bodies");
@@ -495,9 +596,28 @@ static bool read_probes(struct scene *scene) {
         vector(box, "max", probe->box_max);
         probe->scale = number(json, "scale");
         probe->average = number(json, "average");
+        if ((probe->has_select = json_member(json, "select") != NULL)) {
+            read_select(json_member(json, "select"), &probe->select);
+            if (probe->body < 0 && def->n_bodies == 1)
+                probe->body = 0;
+        }
+        if (probe->kind == MPM_PROBE_ERROR && !read_error(scene, json, probe))
+            return false;
     }
     def->probes = probes;
     return true;
+}
+
+// A value that stands in a table.
+static double cited(const cJSON *reference, double end) {
+    const cJSON *value = json_member(reference, "value");
+    struct scene_table table;
+    double found = NAN;
+    if (scene_table_read(text(value, "table"), &table))
+        found = scene_table_value(&table, scene_table_column(&table, text(value, "column")),
+                                  scene_cited_at(reference, end));
+    scene_table_free(&table);
+    return found;
 }
 
 static bool read_references(struct scene *scene) {
@@ -518,6 +638,8 @@ static bool read_references(struct scene *scene) {
         reference->at_end = cJSON_IsString(at);
         reference->at = reference->at_end ? 0 : at->valuedouble;
         reference->value = number(json, "value");
+        if (cJSON_IsObject(json_member(json, "value")))
+            reference->value = cited(json, scene->config.end);
         reference->tolerance = number(json, "tolerance");
         reference->source = text(json, "source");
     }
@@ -557,6 +679,7 @@ static bool read_definition(struct scene *scene) {
     def->cell = number(root, "cell");
     def->basis = (enum mpm_basis)mpm_basis_parse(text(root, "basis"));
     def->settings = scene->config.settings;
+    read_body_force(json_member(root, "body_force"), &def->body_force);
     def->unstable_ok = flag(root, "unstable_ok") || flag(json_member(root, "time"), "unstable_ok");
     def->memory_limit = physical_memory();
     def->wants_displacement = wants(root, MPM_FIELD_DISPLACEMENT);
@@ -594,9 +717,9 @@ static cJSON *holder_of(cJSON *root, const char *pointer, char *key, size_t n) {
 // Takes out what is at fault where nothing that mpm_check looks at hangs on it: unknown keys, and
 // sections about output and forces. Whether what is left is worth another look.
 static bool prune(cJSON *json, const struct faults *faults, size_t from) {
-    static const char *const apart[] = {"title", "references",   "probes",  "output",
-                                        "loads", "rigid_bodies", "gravity", "damping",
-                                        "fbar",  "transfer"};
+    static const char *const apart[] = {"title", "references",   "probes",    "output",
+                                        "loads", "rigid_bodies", "gravity",   "damping",
+                                        "fbar",  "transfer",     "body_force"};
     for (size_t i = from; i < faults->count; i++) {
         const struct fault *fault = &faults->items[i];
         char key[256] = "";

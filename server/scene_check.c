@@ -10,6 +10,7 @@
 
 #include "server/scene_fault.h"
 #include "server/scene_keys.h"
+#include "server/scene_tables.h"
 
 struct check {
     cJSON *root;
@@ -686,6 +687,16 @@ static void check_extreme(struct check *check, const cJSON *select, const char *
     }
 }
 
+// What is chosen by `extreme` or by `box`.
+static void check_select(struct check *check, const cJSON *select, const struct scene_cursor *at) {
+    const cJSON *box = json_member(select, "box"), *extreme = json_member(select, "extreme");
+    if (cJSON_IsObject(select) && !box && !extreme)
+        scene_fault(check->faults, at, "required", "`extreme` or `box`", NULL,
+                    "`select` needs `extreme` or `box`");
+    if (!box && cJSON_IsString(extreme) && strlen(extreme->valuestring) == 2)
+        check_extreme(check, select, extreme->valuestring, at);
+}
+
 static void check_loads(struct check *check, const cJSON *loads, const struct scene_cursor *root) {
     struct scene_cursor map = {.parent = root, .key = "loads"};
     for (const cJSON *load = loads->child; load; load = load->next) {
@@ -694,7 +705,6 @@ static void check_loads(struct check *check, const cJSON *loads, const struct sc
         struct scene_cursor force = {.parent = &item, .key = "force"};
         struct scene_cursor pressure = {.parent = &item, .key = "pressure"};
         const cJSON *select = json_member(load, "select"), *box = json_member(select, "box");
-        const cJSON *extreme = json_member(select, "extreme");
         if (!cJSON_IsObject(load))
             continue;
         if (!json_member(load, "force") && !json_member(load, "pressure"))
@@ -703,15 +713,59 @@ static void check_loads(struct check *check, const cJSON *loads, const struct sc
         if (box && json_member(load, "pressure"))
             scene_fault(check->faults, &pressure, "conflict", "absent", NULL,
                         "a pressure acts on a layer and not on a box; select an extreme");
-        if (cJSON_IsObject(select) && !box && !extreme)
-            scene_fault(check->faults, &selected, "required", "`extreme` or `box`", NULL,
-                        "`select` needs `extreme` or `box`");
-        if (!box && cJSON_IsString(extreme) && strlen(extreme->valuestring) == 2)
-            check_extreme(check, select, extreme->valuestring, &selected);
+        check_select(check, select, &selected);
     }
 }
 
-// A displacement is that of one place or the mean over a box; a reaction is on a wall or a rigid
+// The index of a component of the error probe's field; -1 without one, and where it is at fault.
+static int error_component(struct check *check, const cJSON *probe, const struct scene_cursor *at) {
+    const cJSON *word = json_member(probe, "component"), *field = json_member(probe, "field");
+    int code = cJSON_IsString(field) ? mpm_field_parse(field->valuestring) : -1;
+    if (!cJSON_IsString(word) || code < 0 || !check->dimension)
+        return -1;
+    struct scene_suggestion s = {.word = word->valuestring};
+    char expected[160] = "one of";
+    const char *name;
+    for (int c = 0; (name = scene_field_component((enum mpm_field)code, check->dimension, c));
+         c++) {
+        if (*name && strcmp(name, word->valuestring) == 0)
+            return c;
+        scene_suggest(&s, name);
+        size_t length = strlen(expected);
+        snprintf(expected + length, sizeof expected - length, "%s%s", c ? ", " : " ", name);
+    }
+    struct scene_cursor here = {.parent = at, .key = "component"};
+    if (!*scene_field_component((enum mpm_field)code, check->dimension, 0))
+        scene_fault(check->faults, &here, "conflict", "absent", NULL,
+                    "`%s` has one value and no components", field->valuestring);
+    else
+        scene_unknown_fault(check->faults, &here, "choice", expected, "unknown component", &s);
+    return -1;
+}
+
+// A table needs a position and the components of the field.
+static void check_error_table(struct check *check, const cJSON *probe,
+                              const struct scene_cursor *at) {
+    const cJSON *against = json_member(probe, "against"), *field = json_member(probe, "field");
+    int component = error_component(check, probe, at);
+    int code = cJSON_IsString(field) ? mpm_field_parse(field->valuestring) : -1;
+    struct scene_table table;
+    if (!cJSON_IsString(against) || code < 0 || !check->dimension ||
+        !scene_table_read(against->valuestring, &table))
+        return;
+    struct scene_cursor here = {.parent = at, .key = "against"};
+    int columns[MPM_MAX_COMPONENTS];
+    char lacks[40] = "X";
+    bool placed = scene_table_column(&table, "X") >= 0 || scene_table_column(&table, "Y") >= 0 ||
+                  (check->dimension == 3 && scene_table_column(&table, "Z") >= 0);
+    if (!placed || !scene_table_field(&table, (enum mpm_field)code, component, check->dimension,
+                                      columns, lacks))
+        scene_given_fault(check->faults, &here, "conflict", "a table with that column", against,
+                          "the table `%s` has no column `%s`", against->valuestring, lacks);
+    scene_table_free(&table);
+}
+
+// A displacement is that of one place or the mean over some; a reaction is on a wall or a rigid
 // body.
 static void check_probes(struct check *check, const cJSON *probes,
                          const struct scene_cursor *root) {
@@ -727,15 +781,31 @@ static void check_probes(struct check *check, const cJSON *probes,
             scene_fault(check->faults, &wall, "required", "a name in `walls`", NULL,
                         "a reaction needs `wall` or `rigid_body`");
         if (kind == MPM_PROBE_DISPLACEMENT && !json_member(probe, "at") &&
-            !json_member(probe, "box"))
+            !json_member(probe, "box") && !json_member(probe, "select"))
             scene_fault(check->faults, &at, "required", "a vector in m", NULL,
-                        "a displacement needs `at`, or `box` for the mean over it");
+                        "a displacement needs `at`, or `box` or `select` for the mean over it");
+        struct scene_cursor select = {.parent = &item, .key = "select"};
+        check_select(check, json_member(probe, "select"), &select);
+        if (kind == MPM_PROBE_ERROR)
+            check_error_table(check, probe, &item);
     }
 }
 
-const char *scene_probe_component(const cJSON *probe, int dimension, int index) {
+static const char *shape_component(enum mpm_shape_of_field shape, int dimension, int index) {
     static const char *const tensor[2][9] = {
         {"xx", "xy", "yx", "yy"}, {"xx", "xy", "xz", "yx", "yy", "yz", "zx", "zy", "zz"}};
+    if (shape == MPM_SCALAR)
+        return index == 0 ? "" : NULL;
+    if (shape == MPM_VECTOR)
+        return index < dimension ? scene_axis_choice((size_t)index) : NULL;
+    return index < dimension * dimension ? tensor[dimension - 2][index] : NULL;
+}
+
+const char *scene_field_component(enum mpm_field field, int dimension, int index) {
+    return shape_component(mpm_field_info(field)->shape, dimension, index);
+}
+
+const char *scene_probe_component(const cJSON *probe, int dimension, int index) {
     static const char *const energy[] = {"kinetic", "strain", "potential", "total"};
     const cJSON *word = json_member(probe, "kind"), *field = json_member(probe, "field");
     int kind = cJSON_IsString(word) ? mpm_probe_kind_parse(word->valuestring) : -1;
@@ -758,11 +828,46 @@ const char *scene_probe_component(const cJSON *probe, int dimension, int index) 
         break;
     }
     }
-    if (shape == MPM_SCALAR)
-        return index == 0 ? "" : NULL;
-    if (shape == MPM_VECTOR)
-        return index < dimension ? scene_axis_choice((size_t)index) : NULL;
-    return index < dimension * dimension ? tensor[dimension - 2][index] : NULL;
+    return shape_component(shape, dimension, index);
+}
+
+// A value from a table: the column is there, and the place within the rows.
+static void check_cited(struct check *check, const cJSON *reference,
+                        const struct scene_cursor *item) {
+    const cJSON *value = json_member(reference, "value"), *name = json_member(value, "table");
+    const cJSON *column = json_member(value, "column");
+    struct scene_table table;
+    if (!cJSON_IsString(name) || !cJSON_IsString(column) ||
+        !scene_table_read(name->valuestring, &table))
+        return;
+    struct scene_cursor here = {.parent = item, .key = "value"};
+    struct scene_cursor place = {.parent = &here, .key = "column"};
+    struct scene_suggestion s = {.word = column->valuestring};
+    char expected[400] = "one of";
+    const int index = scene_table_column(&table, column->valuestring);
+    for (size_t c = 0; c < table.n_columns; c++) {
+        size_t length = strlen(expected);
+        scene_suggest(&s, table.names[c]);
+        snprintf(expected + length, sizeof expected - length, "%s%s", c ? ", " : " ",
+                 table.names[c]);
+    }
+    if (index < 0) {
+        scene_unknown_fault(check->faults, &place, "choice", expected, "unknown column", &s);
+    } else if (isnan(scene_table_value(&table, index, scene_cited_at(reference, check->end)))) {
+        place.key = "at";
+        snprintf(expected, sizeof expected, "from %.9g to %.9g, as the table's %s", table.values[0],
+                 table.values[(table.n_rows - 1) * table.n_columns], table.names[0]);
+        scene_fault(check->faults, &place, "range", expected, NULL,
+                    "the place in the table must be %s", expected);
+    }
+    scene_table_free(&table);
+}
+
+double scene_cited_at(const cJSON *reference, double end) {
+    const cJSON *at = json_member(json_member(reference, "value"), "at");
+    if (!at)
+        at = json_member(reference, "at");
+    return cJSON_IsNumber(at) ? at->valuedouble : end;
 }
 
 static void check_references(struct check *check, const cJSON *references,
@@ -776,6 +881,7 @@ static void check_references(struct check *check, const cJSON *references,
         const cJSON *name = json_member(reference, "probe");
         const cJSON *component = json_member(reference, "component");
         const cJSON *probe = cJSON_IsString(name) ? json_member(probes, name->valuestring) : NULL;
+        check_cited(check, reference, &item);
         if (!probe || !check->dimension || (component && !cJSON_IsString(component)))
             continue;
         struct scene_suggestion s = {.word = component ? component->valuestring : ""};

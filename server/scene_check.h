@@ -3,6 +3,7 @@
 #include <cjson/cJSON.h>
 
 #include "server/json.h"
+#include "server/mpm/mpm.h"
 
 // Checks `scene` and adds its faults; fills defaults into it, so that without a fault every key
 // that the table gives a default is there. What only the solver can see is not checked here.
@@ -13,3 +14,8 @@ void scene_check_live(cJSON *patch, struct faults *faults);
 // The components of a probe (checked JSON): the name of component `index`, NULL past the last; ""
 // for the one component of a scalar.
 const char *scene_probe_component(const cJSON *probe, int dimension, int index);
+// The same of a field.
+const char *scene_field_component(enum mpm_field field, int dimension, int index);
+// Where in a table's first column a reference whose value is cited reads it: its own `at`, or the
+// reference's time.
+double scene_cited_at(const cJSON *reference, double end);

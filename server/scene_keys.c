@@ -7,6 +7,8 @@
 #include <stdio.h>
 #include <string.h>
 
+#include "server/scene_tables.h"
+
 // ---- Choices ------------------------------------------------------------------------------------
 
 #define CHOICES(name, ...)                                                                         \
@@ -42,6 +44,9 @@ static const char *condition_choice(size_t index) {
 }
 static const char *probe_choice(size_t index) {
     return index < MPM_N_PROBE_KINDS ? mpm_probe_kind_name((enum mpm_probe_kind)index) : NULL;
+}
+static const char *norm_choice(size_t index) {
+    return index < MPM_N_NORMS ? mpm_norm_name((enum mpm_norm)index) : NULL;
 }
 static const char *field_choice(size_t index) {
     return index < MPM_N_FIELDS ? mpm_field_info((enum mpm_field)index)->name : NULL;
@@ -165,6 +170,109 @@ static const struct scene_key mode_keys[] = {
      .doc = "number of the mode, n"},
     {"amplitude", NUMBER("m/s"), .required = true, .doc = "velocity of the free end, v0"},
     END};
+
+// ---- Exact and manufactured solutions -----------------------------------------------------------
+
+#define CENTRE                                                                                     \
+    { "center", VECTOR("m"), .fallback = "0", .doc = "its centre; in 3D, the axis is along z" }
+#define INNER                                                                                      \
+    { "inner", POSITIVE("m"), .required = true, .doc = "inner radius, A" }
+#define OUTER                                                                                      \
+    { "outer", POSITIVE("m"), .required = true, .doc = "outer radius, B, above `inner`" }
+static const struct scene_key vortex_keys[] = {
+    CENTRE,
+    INNER,
+    OUTER,
+    {"amplitude", NUMBER("rad"), .required = true, .doc = "largest turn, G"},
+    {"period", POSITIVE("s"), .required = true, .doc = "time to the first return, T"},
+    END};
+static const struct scene_key taylor_green_keys[] = {
+    {"center", VECTOR("m"), .fallback = "0", .doc = "a point where the flow stands, at a corner"},
+    {"wavelength", POSITIVE("m"), .required = true, .doc = "L; a vortex is L/2 wide"},
+    {"speed", NUMBER("m/s"), .required = true, .doc = "largest speed, U"},
+    END};
+static const struct scene_key tube_keys[] = {
+    CENTRE,
+    INNER,
+    OUTER,
+    {"rate", NUMBER("m^2/s"), .required = true,
+     .doc = "d(r^2)/dt at the start, the same for all radii; v = rate / (2 R)"},
+    END};
+static const struct scene_key cylinder_solution_keys[] = {
+    CENTRE,
+    INNER,
+    OUTER,
+    {"pressure", NUMBER("Pa"), .required = true, .doc = "pressure inside, p"},
+    END};
+static const struct scene_key column_keys[] = {
+    {"axis", AXIS, .required = true, .doc = "along it, and along gravity"},
+    {"from", NUMBER("m"), .fallback = "0", .doc = "the fixed end"},
+    {"length", POSITIVE("m"), .required = true, .doc = "from there to the free end, H"},
+    END};
+static const struct scene_key ritter_keys[] = {
+    {"gate", NUMBER("m"), .required = true, .doc = "where the gate was, x0; the water before it"},
+    {"depth", POSITIVE("m"), .required = true, .doc = "its depth above the floor at 0, H"},
+    END};
+#define ROTATION_KEY(text)                                                                         \
+    {                                                                                              \
+        "rotation",                                                                                \
+            {.type = SCENE_OBJECT,                                                                 \
+             .keys = rotation_keys,                                                                \
+             .section = "The velocity field `rotation`"},                                          \
+            .doc = text                                                                            \
+    }
+#define MODE_KEY(text)                                                                             \
+    {                                                                                              \
+        "mode", {.type = SCENE_OBJECT, .keys = mode_keys, .section = "The velocity field `mode`"}, \
+            .doc = text                                                                            \
+    }
+#define VORTEX_KEY(text)                                                                           \
+    {                                                                                              \
+        "vortex", {.type = SCENE_OBJECT, .keys = vortex_keys, .section = "The solution `vortex`"}, \
+            .doc = text                                                                            \
+    }
+#define TAYLOR_GREEN_KEY(text)                                                                     \
+    {                                                                                              \
+        "taylor_green",                                                                            \
+            {.type = SCENE_OBJECT,                                                                 \
+             .keys = taylor_green_keys,                                                            \
+             .section = "The solution `taylor_green`"},                                            \
+            .doc = text                                                                            \
+    }
+#define TUBE_KEY(text)                                                                             \
+    {                                                                                              \
+        "tube", {.type = SCENE_OBJECT, .keys = tube_keys, .section = "The solution `tube`"},       \
+            .doc = text                                                                            \
+    }
+static const struct scene_key solution_keys[] = {
+    ROTATION_KEY("rigid rotation of any body: position, velocity, no stress"),
+    MODE_KEY("axial vibration between slip walls, at small strain"),
+    {"column",
+     {.type = SCENE_OBJECT, .keys = column_keys, .section = "The solution `column`"},
+     .doc = "a confined column at rest under its weight: water, or neo-Hookean at any strain"},
+    {"lame",
+     {.type = SCENE_OBJECT,
+      .keys = cylinder_solution_keys,
+      .section = "The solutions `lame` and `cylinder`"},
+     .doc = "Lame's thick-walled cylinder under pressure, at small strain"},
+    {"cylinder",
+     {.type = SCENE_OBJECT,
+      .keys = cylinder_solution_keys,
+      .section = "The solutions `lame` and `cylinder`"},
+     .doc = "the same of a neo-Hookean material at finite strain"},
+    TUBE_KEY("free radial oscillation of an incompressible neo-Hookean tube (no stress)"),
+    VORTEX_KEY("generalised vortex, with the body force of the same name"),
+    TAYLOR_GREEN_KEY("decaying vortices of a viscous fluid: velocity and pressure"),
+    {"ritter",
+     {.type = SCENE_OBJECT, .keys = ritter_keys, .section = "The solution `ritter`"},
+     .doc = "the dam break of shallow water over a dry floor: displacement and velocity"},
+    END};
+static const struct scene_key force_keys[] = {
+    VORTEX_KEY("the force that makes the generalised vortex a solution, of a neo-Hookean material"),
+    END};
+static const struct scene_value force_forms[] = {
+    VECTOR("m/s^2"), {.type = SCENE_ONE_KEY, .keys = force_keys, .section = "Body forces"}};
+
 static const struct scene_key velocity_keys[] = {
     {"rotation",
      {.type = SCENE_OBJECT, .keys = rotation_keys, .section = "The velocity field `rotation`"},
@@ -172,6 +280,9 @@ static const struct scene_key velocity_keys[] = {
     {"mode",
      {.type = SCENE_OBJECT, .keys = mode_keys, .section = "The velocity field `mode`"},
      .doc = "axial mode of a bar: v = v0 sin((2n - 1) pi (X - from) / (2 length)) along `axis`"},
+    VORTEX_KEY("across the radius, v = R (pi G / T) h(R): docs/method.md, section 11"),
+    TAYLOR_GREEN_KEY("v = U (sin kx cos ky, -cos kx sin ky), k = 2 pi / L"),
+    TUBE_KEY("outwards, v = rate / (2 R)"),
     END};
 static const struct scene_value velocity_forms[] = {
     VECTOR("m/s"), {.type = SCENE_ONE_KEY, .keys = velocity_keys, .section = "Velocity fields"}};
@@ -420,7 +531,12 @@ static const struct scene_value stage = {
 
 #define KIND(code) (1U << MPM_PROBE_##code)
 #define FOLDS (KIND(MAXIMUM) | KIND(MINIMUM) | KIND(MEAN))
-#define PARTICLES (KIND(DISPLACEMENT) | KIND(FIELD) | FOLDS)
+#define PARTICLES (KIND(DISPLACEMENT) | KIND(FIELD) | KIND(ERROR) | FOLDS)
+#define CHOOSES (KIND(DISPLACEMENT) | KIND(ERROR) | FOLDS)
+#define READS_FIELD (KIND(FIELD) | KIND(ERROR) | FOLDS)
+static const struct scene_value against_forms[] = {
+    {.type = SCENE_CHOICE, .choice = scene_table_choice},
+    {.type = SCENE_ONE_KEY, .keys = solution_keys, .section = "Solutions"}};
 static const struct scene_key probe_keys[] = {
     {"kind", CHOICE(probe), .required = true, .selector = true, .doc = "what is measured"},
     {"body", NAME("bodies"), .only = PARTICLES | KIND(EXTENT) | KIND(DRIFT),
@@ -428,8 +544,13 @@ static const struct scene_key probe_keys[] = {
     {"wall", NAME("walls"), .only = KIND(REACTION), .doc = "the force on this wall"},
     {"rigid_body", NAME("rigid_bodies"), .only = KIND(REACTION), .excludes = "wall",
      .doc = "the force on this rigid body; a reaction is that of one of the two"},
-    {"field", CHOICE(field), .only = KIND(FIELD) | FOLDS, .needs = KIND(FIELD) | FOLDS,
-     .doc = "the field"},
+    {"field", CHOICE(field), .only = READS_FIELD, .needs = READS_FIELD, .doc = "the field"},
+    {"against", EITHER(against_forms), .only = KIND(ERROR), .needs = KIND(ERROR),
+     .doc = "a solution, or a table of values at reference positions, `scenes/reference/NAME.csv`"},
+    {"norm", CHOICE(norm), .only = KIND(ERROR), .fallback = "\"rms\"",
+     .doc = "`rms`: RMS error over the standard deviation of the reference; `l2`: over its RMS; "
+            "`max`: largest over largest; `absolute`: RMS error in the field's unit"},
+    {"component", TEXT, .only = KIND(ERROR), .doc = "only this component of the field"},
     {"axis", AXIS, .only = KIND(EXTENT), .needs = KIND(EXTENT), .doc = "along this axis"},
     {"side", CHOICE(side), .only = KIND(EXTENT), .fallback = "\"max\"",
      .doc = "the greatest or the least coordinate"},
@@ -440,8 +561,18 @@ static const struct scene_key probe_keys[] = {
      .doc = "1: the outermost particle; q: this part of the particles lies inside"},
     {"at", VECTOR("m"), .only = KIND(DISPLACEMENT) | KIND(FIELD), .needs = KIND(FIELD),
      .excludes = "box", .doc = "a reference point: the particle that starts nearest to it is read"},
-    {"box", BOX, .only = KIND(DISPLACEMENT) | FOLDS, .excludes = "at",
+    {"box", BOX, .only = CHOOSES, .excludes = "at",
      .doc = "only the particles that start in this box; of a displacement, the mean over them"},
+    {"select",
+     {.type = SCENE_OBJECT, .keys = select_keys, .section = "A load's `select`"},
+     .only = CHOOSES,
+     .excludes = "at",
+     .doc =
+         "only the particles of `body` that a load would choose so; of a displacement, the mean"},
+    {"exclude",
+     {.type = SCENE_ONE_KEY, .keys = shape_keys, .section = "Shapes", .definition = "shape"},
+     .only = KIND(ERROR),
+     .doc = "not the particles that start in this shape"},
     {"scale", NUMBER("1"), .fallback = "1", .doc = "factor on every value"},
     {"average", NOT_NEGATIVE("s"), .fallback = "0",
      .doc = "moving mean over this window; 0: the value itself"},
@@ -450,14 +581,28 @@ static const struct scene_value probe = {
     .type = SCENE_OBJECT, .keys = probe_keys, .section = "`probes.NAME`"};
 
 static const struct scene_value at_forms[] = {NUMBER("s"), CHOICE(end)};
+static const struct scene_key cited_keys[] = {
+    {"table",
+     {.type = SCENE_CHOICE, .choice = scene_table_choice},
+     .required = true,
+     .doc = "`scenes/reference/NAME.csv`"},
+    {"column", TEXT, .required = true, .doc = "name of the column that is read"},
+    {"at", NUMBER("the first column's"),
+     .doc = "where in the first column, between rows linearly; without it, the reference's time"},
+    END};
+static const struct scene_value reference_forms[] = {
+    NUMBER("the probe's"),
+    {.type = SCENE_OBJECT, .keys = cited_keys, .section = "A reference's `value` as an object"}};
 static const struct scene_key reference_keys[] = {
     {"probe", NAME("probes"), .required = true, .doc = "the probe that is compared"},
     {"component", TEXT,
      .doc = "of a probe with several: `x`, `y`, `z`; `xx`, `xy`, ...; `kinetic`, `strain`, "
             "`potential`, `total`"},
     {"at", EITHER(at_forms), .required = true, .doc = "when: a time, or `\"end\"`"},
-    {"value", NUMBER("the probe's"), .required = true, .doc = "what it should be"},
-    {"tolerance", POSITIVE("1"), .required = true, .doc = "accepted relative error"},
+    {"value", EITHER(reference_forms), .required = true,
+     .doc = "what it should be: a number, or one of a table"},
+    {"tolerance", POSITIVE("1"), .required = true,
+     .doc = "accepted relative error; of a reference of 0, accepted value"},
     {"source", TEXT, .fallback = "\"\"", .doc = "where the value comes from"},
     END};
 static const struct scene_value reference = {
@@ -485,6 +630,8 @@ static const struct scene_key root_keys[] = {
     {"unstable_ok", BOOL, .fallback = "false",
      .doc = "accept a `dt` above the stability limit, which is otherwise refused"},
     {"gravity", VECTOR("m/s^2"), .live = true, .fallback = "0", .doc = "acceleration"},
+    {"body_force", EITHER(force_forms), .fallback = "0",
+     .doc = "force per mass on all matter, besides gravity"},
     {"damping", DAMPING, .live = true, .fallback = "{}", .doc = "artificial damping"},
     {"materials",
      {.type = SCENE_MAP, .items = &material},

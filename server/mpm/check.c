@@ -1,8 +1,8 @@
 // What the library can see to be wrong with a definition, each fault with its place in the scene.
-#include <stdarg.h>
 #include <stdio.h>
 #include <string.h>
 
+#include "server/mpm/check_inside.h"
 #include "server/mpm/seed.h"
 #include "server/mpm/sim.h"
 
@@ -11,41 +11,6 @@
 #define MAX_NODES 1e9  // with whole blocks of 4 a direction, node numbers still fit 32 bits
 #define MAX_STEPS 1e15 // beyond it doubles soon no longer count one by one
 #define NODE_PLANE_TOLERANCE 1e-6 // cells: round-off of a wall's place, far below any offset meant
-
-struct report {
-    void (*call)(void *context, const struct mpm_error *fault);
-    void *context;
-    size_t count;
-};
-
-static void add(struct report *r, const struct mpm_error *fault) {
-    r->count++;
-    if (r->call) {
-        r->call(r->context, fault);
-    }
-}
-
-#define FAULT(r, status, pointer, expected, actual, ...)                                           \
-    do {                                                                                           \
-        struct mpm_error fault_;                                                                   \
-        mpm_fail_value(&fault_, status, pointer, expected, actual, __VA_ARGS__);                   \
-        add(r, &fault_);                                                                           \
-    } while (0)
-
-// Text that lives until the end of the statement it stands in.
-#define TEXT(...) text((char[256]){0}, __VA_ARGS__)
-static const char *text(char *out, const char *format, ...) __attribute__((format(printf, 2, 3)));
-static const char *text(char *out, const char *format, ...) {
-    va_list arguments;
-    va_start(arguments, format);
-    vsnprintf(out, 256, format, arguments);
-    va_end(arguments);
-    return out;
-}
-
-static bool is_finite(double x) {
-    return x - x == 0;
-}
 
 static double largest_speed(const struct mpm_def *def) {
     double largest = 0;
@@ -57,6 +22,8 @@ static double largest_speed(const struct mpm_def *def) {
         }
         if (v->kind == MPM_VELOCITY_MODE) {
             speed2 = v->amplitude * v->amplitude;
+        } else if (v->kind == MPM_VELOCITY_SOLUTION) {
+            speed2 = mpm_solution_speed(&v->solution) * mpm_solution_speed(&v->solution);
         } else { // linear in x: largest at a corner of the bounding box
             for (int corner = 0; corner < 1 << def->dimension; corner++) {
                 double x[MPM_MAX_DIM], at[MPM_MAX_DIM], here = 0;
@@ -692,28 +659,8 @@ static void check_rigid_place(struct report *r, const struct mpm_def *def, size_
     }
 }
 
-static void check_probe(struct report *r, const struct mpm_def *def,
-                        const struct mpm_probe_def *q) {
-    if (q->body >= (int)def->n_bodies) {
-        FAULT(r, MPM_ERR_REFERENCE, TEXT("/probes/%s/body", q->name), "a body", TEXT("%d", q->body),
-              "probe '%s' names no body", q->name);
-    }
-    if (q->kind == MPM_PROBE_REACTION &&
-        (q->wall >= 0 ? (size_t)q->wall >= def->n_walls
-                      : q->rigid < 0 || (size_t)q->rigid >= def->n_rigids)) {
-        FAULT(r, MPM_ERR_REFERENCE, TEXT("/probes/%s/wall", q->name), "a wall or rigid body",
-              TEXT("%d", q->wall), "probe '%s' names no wall and no rigid body", q->name);
-    }
-    if (q->kind == MPM_PROBE_EXTENT && !(q->quantile > 0 && q->quantile <= 1)) {
-        FAULT(r, MPM_ERR_RANGE, TEXT("/probes/%s/quantile", q->name), "above 0 and at most 1",
-              TEXT("%.9g", q->quantile), "the quantile of probe '%s' must be in (0, 1]", q->name);
-    }
-    if (!(q->average >= 0 && is_finite(q->average))) {
-        FAULT(r, MPM_ERR_RANGE, TEXT("/probes/%s/average", q->name), "at least 0, s",
-              TEXT("%.9g", q->average), "the averaging window of probe '%s' must not be negative",
-              q->name);
-    }
-}
+// ---- Stages and times
+// -----------------------------------------------------------------------------
 
 static void check_stages(struct report *r, const struct mpm_def *def) {
     for (size_t k = 0; k < def->n_stages; k++) {
@@ -786,10 +733,20 @@ size_t mpm_check(const struct mpm_def *def,
     }
     check_stages(&r, def);
     for (size_t k = 0; k < def->n_probes; k++) {
-        check_probe(&r, def, &def->probes[k]);
+        const struct mpm_probe_def *q = &def->probes[k];
+        mpm_check_probe(&r, def, q);
+        if (q->has_exclude) {
+            check_shape(&r, &q->exclude, TEXT("/probes/%s/exclude", q->name), def->dimension);
+        }
     }
+    mpm_check_body_force(&r, def);
     for (size_t b = 0; b < def->n_bodies; b++) {
         const struct mpm_body_def *body = &def->bodies[b];
+        if (body->velocity.kind == MPM_VELOCITY_SOLUTION) {
+            const struct mpm_solution *q = &body->velocity.solution;
+            mpm_check_solution(
+                &r, q, TEXT("/bodies/%s/velocity/%s", body->name, mpm_solution_name(q->kind)));
+        }
         check_shape(&r, &body->shape, TEXT("/bodies/%s/shape", body->name), def->dimension);
     }
     for (size_t k = 0; k < def->n_loads; k++) {
@@ -811,6 +768,9 @@ size_t mpm_check(const struct mpm_def *def,
     }
     for (size_t k = 0; k < def->n_loads && r.count == 0; k++) {
         check_load_particles(&r, def, &def->loads[k]);
+    }
+    for (size_t k = 0; k < def->n_probes && r.count == 0; k++) {
+        mpm_check_probe_particles(&r, def, &def->probes[k]);
     }
     for (size_t k = 0; k < def->n_rigids && total < INFINITY; k++) {
         check_rigid_place(&r, def, k);

@@ -28,8 +28,19 @@
     X(FIELD, "field")                                                                              \
     X(REACTION, "reaction")                                                                        \
     X(MAXIMUM, "maximum")                                                                          \
-    X(MINIMUM, "minimum") X(MEAN, "mean") X(ENERGY, "energy") X(MOMENTUM, "momentum")              \
-        X(DRIFT, "drift")
+    X(MINIMUM, "minimum")                                                                          \
+    X(MEAN, "mean")                                                                                \
+    X(ERROR, "error") X(ENERGY, "energy") X(MOMENTUM, "momentum") X(DRIFT, "drift")
+// How an error is measured: RMS over the standard deviation of the reference, over its RMS; largest
+// over largest; and RMS itself, in the field's unit.
+#define MPM_NORM_LIST(X) X(RMS, "rms") X(L2, "l2") X(MAX, "max") X(ABSOLUTE, "absolute")
+#define MPM_SOLUTION_LIST(X)                                                                       \
+    X(ROTATION, "rotation")                                                                        \
+    X(MODE, "mode")                                                                                \
+    X(COLUMN, "column")                                                                            \
+    X(LAME, "lame")                                                                                \
+    X(CYLINDER, "cylinder")                                                                        \
+    X(TUBE, "tube") X(VORTEX, "vortex") X(TAYLOR_GREEN, "taylor_green") X(RITTER, "ritter")
 
 // Instruction sets of the kernels: plain scalar code, and lanes of 4 or 8 (x86-64-v3 and v4).
 #define MPM_ISA_LIST(X) X(AUTO, "auto") X(BASELINE, "baseline") X(AVX2, "avx2") X(AVX512, "avx512")
@@ -58,6 +69,18 @@ enum mpm_probe_kind {
 #undef X
         MPM_N_PROBE_KINDS
 };
+enum mpm_norm {
+#define X(code, text) MPM_NORM_##code,
+    MPM_NORM_LIST(X)
+#undef X
+        MPM_N_NORMS
+};
+enum mpm_solution_kind {
+#define X(code, text) MPM_SOLUTION_##code,
+    MPM_SOLUTION_LIST(X)
+#undef X
+        MPM_N_SOLUTIONS
+};
 
 enum mpm_isa {
 #define X(code, text) MPM_ISA_##code,
@@ -75,11 +98,15 @@ const char *mpm_fbar_name(enum mpm_fbar_scheme scheme);
 const char *mpm_wall_condition_name(enum mpm_wall_condition condition);
 const char *mpm_probe_kind_name(enum mpm_probe_kind kind);
 const char *mpm_isa_name(enum mpm_isa isa);
+const char *mpm_norm_name(enum mpm_norm norm);
+const char *mpm_solution_name(enum mpm_solution_kind kind);
 int mpm_basis_parse(const char *text);
 int mpm_fbar_parse(const char *text);
 int mpm_wall_condition_parse(const char *text);
 int mpm_probe_kind_parse(const char *text);
 int mpm_isa_parse(const char *text);
+int mpm_norm_parse(const char *text);
+int mpm_solution_parse(const char *text);
 
 // ---- Materials
 // ------------------------------------------------------------------------------------
@@ -141,11 +168,27 @@ struct mpm_shape {
     const struct mpm_shape *children;
 };
 
+// An exact or manufactured solution: docs/method.md section 11. Each kind uses some of these. The
+// round ones lie in the plane of x and y, about `centre`.
+struct mpm_solution {
+    enum mpm_solution_kind kind;
+    double centre[MPM_MAX_DIM]; // m
+    double vector[MPM_MAX_DIM]; // of a rotation in 3D: its axis, of length 1
+    int axis, number;           // of a mode and a column: along it; number of the mode
+    double from, length;        // m, of a mode, a column, ritter's gate and depth, a vortex pair
+    double inner, outer;        // m, radii of the round ones
+    double amplitude;           // m/s of a mode and of taylor_green, rad of a vortex
+    double rate;                // rad/s of a rotation; m^2/s of a tube, d(r^2)/dt at t = 0
+    double period;              // s, of a vortex: of half its swing
+    double pressure;            // Pa, inside lame's and the finite cylinder
+};
+
 enum mpm_velocity_kind {
     MPM_VELOCITY_UNIFORM,  // vector
     MPM_VELOCITY_ROTATION, // rate (rad/s) about centre: in 2D about z, in 3D about `vector` (unit
                            // axis)
     MPM_VELOCITY_MODE,     // v_axis = amplitude sin((2 number - 1) pi (x_axis - from) / (2 length))
+    MPM_VELOCITY_SOLUTION, // as `solution` begins
 };
 struct mpm_velocity {
     enum mpm_velocity_kind kind;
@@ -153,6 +196,14 @@ struct mpm_velocity {
     double centre[MPM_MAX_DIM], rate;
     int axis, number;
     double from, length, amplitude; // m, m, m/s
+    struct mpm_solution solution;
+};
+
+// A force on all matter, per mass, besides gravity; it does not enter the potential energy.
+struct mpm_body_force_def {
+    enum { MPM_BODY_FORCE_NONE, MPM_BODY_FORCE_UNIFORM, MPM_BODY_FORCE_SOLUTION } kind;
+    double vector[MPM_MAX_DIM];   // m/s^2
+    struct mpm_solution solution; // at a particle's reference position, in its own material
 };
 
 struct mpm_body_def {
@@ -239,6 +290,18 @@ struct mpm_load_def {
     double ramp;     // s, linear from 0 since the first step
 };
 
+// What an error is held against: a solution in the material of the probe's body as the last stage
+// has it, with the scene's gravity; or n points and the values there, interpolated (table.h).
+struct mpm_against {
+    bool is_table;
+    struct mpm_solution solution;
+    size_t n;
+    int n_axes;            // coordinates that the points have, up to the dimension
+    int axis[MPM_MAX_DIM]; // which
+    const double *points;  // (n, n_axes) m, reference positions
+    const double *values;  // (n, components of the field, or 1 where `component` >= 0)
+};
+
 struct mpm_probe_def {
     const char *name;
     enum mpm_probe_kind kind;
@@ -252,6 +315,13 @@ struct mpm_probe_def {
     double at[MPM_MAX_DIM];
     bool has_box; // only the particles whose reference position lies in it
     double box_min[MPM_MAX_DIM], box_max[MPM_MAX_DIM];
+    bool has_select; // only the particles that a load of this place would act on; needs a body
+    struct mpm_load_def select;
+    bool has_exclude; // of an error: not the particles that begin in this shape
+    struct mpm_shape exclude;
+    struct mpm_against against; // of an error
+    enum mpm_norm norm;
+    int component;  // of an error: of its field; -1: all of them
     double scale;   // factor on every value
     double average; // s, moving mean over this window; 0 = the value itself
 };
@@ -263,6 +333,7 @@ struct mpm_def {
     double cell;                 // h, m
     enum mpm_basis basis;
     struct mpm_settings settings;
+    struct mpm_body_force_def body_force;
     bool unstable_ok; // accept a dt above the stability limit
     size_t n_materials, n_bodies, n_walls, n_loads, n_rigids, n_stages, n_probes;
     const struct mpm_material_def *materials;

@@ -52,6 +52,11 @@ static inline size_t mpm_at(size_t p, int n_components, int c) {
     return (p / MPM_BLOCK * (size_t)n_components + (size_t)c) * MPM_BLOCK + p % MPM_BLOCK;
 }
 
+// The id of the particle at place p of the storage.
+static inline size_t mpm_particle_id(const struct mpm_particles *s, size_t p) {
+    return (size_t)s->first_id + s->id[p];
+}
+
 #if MPM_LANES == 1
 // Volume ratio that the stress uses at particle p: det F; sqrt(det b), since plastic flow keeps the
 // volume; or Jbar of a fluid.

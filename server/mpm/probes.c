@@ -3,6 +3,14 @@
 
 #include "server/mpm/sim.h"
 
+struct mpm_medium mpm_probe_medium(const struct mpm_def *def, const struct mpm_probe_def *q) {
+    const size_t last = def->n_stages - 1;
+    const struct mpm_material_def *m =
+        mpm_material_of(def, def->bodies[q->body < 0 ? 0 : q->body].material, last);
+    const struct mpm_settings settings = mpm_stage_settings(def, last, &def->settings);
+    return mpm_medium_of(m->model, m->parameters, settings.gravity);
+}
+
 static bool takes_field(enum mpm_probe_kind kind) {
     return kind == MPM_PROBE_FIELD || kind == MPM_PROBE_MAXIMUM || kind == MPM_PROBE_MINIMUM ||
            kind == MPM_PROBE_MEAN;
@@ -63,7 +71,13 @@ void mpm_probes_find_particles(struct mpm_sim *sim) {
     }
 }
 
-static bool in_box(const struct mpm_probe_def *q, const struct mpm_particles *s, size_t p) {
+// Whether the probe reads the particle at place p of a set.
+static bool reads(const struct mpm_sim *sim, size_t probe, const struct mpm_particles *s,
+                  size_t p) {
+    const struct mpm_probe_def *q = &sim->def->probes[probe];
+    if (sim->compares[probe].chosen) {
+        return sim->compares[probe].chosen[mpm_particle_id(s, p)];
+    }
     if (!q->has_box) {
         return true;
     }
@@ -77,7 +91,8 @@ static bool in_box(const struct mpm_probe_def *q, const struct mpm_particles *s,
 }
 
 // Maximum, minimum or mean of a field over the probe's particles; NaN over none.
-static void fold_field(const struct mpm_sim *sim, const struct mpm_probe_def *q, double *out) {
+static void fold_field(const struct mpm_sim *sim, size_t probe, double *out) {
+    const struct mpm_probe_def *q = &sim->def->probes[probe];
     const enum mpm_field field =
         q->kind == MPM_PROBE_DISPLACEMENT ? MPM_FIELD_DISPLACEMENT : (enum mpm_field)q->field;
     const size_t width = mpm_field_components(field, sim->grid.dim);
@@ -85,7 +100,7 @@ static void fold_field(const struct mpm_sim *sim, const struct mpm_probe_def *q,
     for (size_t b = 0; b < sim->n_sets; b++) {
         const struct mpm_particles *s = &sim->sets[b];
         for (size_t p = 0; (q->body < 0 || q->body == (int)b) && p < s->n; p++) {
-            if (!in_box(q, s, p)) {
+            if (!reads(sim, probe, s, p)) {
                 continue;
             }
             double value[MPM_MAX_COMPONENTS];
@@ -176,8 +191,8 @@ static void present_value(struct mpm_sim *sim, size_t probe, double *out) {
         out[0] = extent(sim, q);
         break;
     case MPM_PROBE_DISPLACEMENT:
-        if (q->has_box) {
-            fold_field(sim, q, out);
+        if (q->has_box || q->has_select) {
+            fold_field(sim, probe, out);
             break;
         }
         particle_field(sim, probe, MPM_FIELD_DISPLACEMENT, out);
@@ -192,7 +207,10 @@ static void present_value(struct mpm_sim *sim, size_t probe, double *out) {
     case MPM_PROBE_MAXIMUM:
     case MPM_PROBE_MINIMUM:
     case MPM_PROBE_MEAN:
-        fold_field(sim, q, out);
+        fold_field(sim, probe, out);
+        break;
+    case MPM_PROBE_ERROR:
+        out[0] = mpm_compare_error(&sim->compares[probe], sim, q);
         break;
     case MPM_PROBE_ENERGY:
         mpm_balance(sim, &balance);

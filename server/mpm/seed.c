@@ -8,6 +8,8 @@
 
 #include <math.h>
 
+#include "server/mpm/solution.h"
+
 #define SNAP 1e-7 // half spacings
 
 struct lattice {
@@ -329,6 +331,9 @@ void mpm_velocity_at(const struct mpm_velocity *field, const double *x, int dim,
     case MPM_VELOCITY_MODE:
         v[field->axis] = field->amplitude * sin((2 * field->number - 1) * M_PI / 2 *
                                                 (x[field->axis] - field->from) / field->length);
+        break;
+    case MPM_VELOCITY_SOLUTION:
+        mpm_solution_start(&field->solution, x, dim, v);
         break;
     }
 }

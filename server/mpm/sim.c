@@ -263,9 +263,10 @@ static bool place(void *context, const double *x, double volume) {
 }
 
 static bool wants_x0(const struct mpm_def *def) {
-    bool wanted = def->wants_displacement;
+    bool wanted = def->wants_displacement || def->body_force.kind == MPM_BODY_FORCE_SOLUTION;
     for (size_t k = 0; k < def->n_probes; k++) {
         wanted |= def->probes[k].kind == MPM_PROBE_DISPLACEMENT || def->probes[k].has_box ||
+                  def->probes[k].kind == MPM_PROBE_ERROR ||
                   (def->probes[k].kind != MPM_PROBE_ENERGY &&
                    def->probes[k].field == MPM_FIELD_DISPLACEMENT);
     }
@@ -381,17 +382,35 @@ static bool create_probes(struct mpm_sim *sim) {
     sim->probe_set = calloc(n + 1, sizeof *sim->probe_set);
     sim->probe_particle = calloc(n + 1, sizeof *sim->probe_particle);
     sim->averages = averages ? calloc(n, sizeof *sim->averages) : NULL;
+    sim->compares = calloc(n + 1, sizeof *sim->compares);
     bool sorts = false;
     for (size_t k = 0; k < n; k++) {
         sorts |= sim->def->probes[k].kind == MPM_PROBE_EXTENT && sim->def->probes[k].quantile < 1;
     }
     sim->scratch = sorts ? calloc(sim->n_particles, sizeof *sim->scratch) : NULL;
     if (!sim->probe_set || !sim->probe_particle || (averages && !sim->averages) ||
-        (sorts && !sim->scratch)) {
+        (sorts && !sim->scratch) || !sim->compares) {
         return false;
+    }
+    for (size_t k = 0; k < n; k++) {
+        if (!mpm_compare_create(&sim->compares[k], sim, &sim->def->probes[k])) {
+            return false;
+        }
     }
     mpm_probes_find_particles(sim);
     return true;
+}
+
+static bool create_body_forces(struct mpm_sim *sim) {
+    bool ok = true;
+    if (sim->def->body_force.kind == MPM_BODY_FORCE_NONE) {
+        return true;
+    }
+    sim->body_forces = calloc(sim->n_sets, sizeof *sim->body_forces);
+    for (size_t b = 0; sim->body_forces && b < sim->n_sets; b++) {
+        ok &= mpm_body_force_create(&sim->body_forces[b], &sim->sets[b]);
+    }
+    return ok && sim->body_forces;
 }
 
 static void keep_first(void *context, const struct mpm_error *fault) {
@@ -463,7 +482,7 @@ enum mpm_status mpm_create(const struct mpm_def *def, struct mpm_sim **out, stru
         largest = sim->sets[b].n > largest ? sim->sets[b].n : largest;
     }
     if (!mpm_sorter_create(&sim->sorter, largest, def->n_threads) || !create_probes(sim) ||
-        !mpm_provide_fbar(sim, widest_fbar(def))) {
+        !create_body_forces(sim) || !mpm_provide_fbar(sim, widest_fbar(def))) {
         goto fail;
     }
     sim->c.base = def->settings;
@@ -506,7 +525,15 @@ void mpm_free(struct mpm_sim *sim) {
     for (size_t k = 0; sim->rigids && k < sim->n_rigids; k++) {
         mpm_rigid_free(&sim->rigids[k]);
     }
+    for (size_t k = 0; sim->compares && k < sim->def->n_probes; k++) {
+        mpm_compare_free(&sim->compares[k]);
+    }
+    for (size_t b = 0; sim->body_forces && b < sim->n_sets; b++) {
+        mpm_body_force_free(&sim->body_forces[b]);
+    }
     mpm_grid_free(&sim->grid);
+    free(sim->compares);
+    free(sim->body_forces);
     free(sim->sets);
     free(sim->orders);
     free(sim->walls);
@@ -565,6 +592,12 @@ void mpm_estimate(const struct mpm_def *def, struct mpm_estimate *out) {
     for (size_t k = 0; k < def->n_rigids; k++) {
         out->bytes += mpm_rigid_bytes(&def->rigids[k], def->dimension, out->particles);
     }
+    for (size_t k = 0; k < def->n_probes; k++) {
+        out->bytes += mpm_compare_bytes(&def->probes[k], def->dimension, out->particles);
+    }
+    if (def->body_force.kind != MPM_BODY_FORCE_NONE) {
+        out->bytes += mpm_body_force_bytes(def->dimension, out->particles);
+    }
     if (c.out_of_memory) {
         out->bytes = SIZE_MAX;
     }
@@ -621,6 +654,12 @@ size_t mpm_bytes(const struct mpm_sim *sim) {
     }
     for (size_t k = 0; k < sim->n_rigids; k++) {
         bytes += sim->rigids[k].anchor_bytes;
+    }
+    for (size_t k = 0; k < sim->def->n_probes; k++) {
+        bytes += mpm_compare_bytes(&sim->def->probes[k], sim->grid.dim, sim->n_particles);
+    }
+    if (sim->body_forces) {
+        bytes += mpm_body_force_bytes(sim->grid.dim, sim->n_particles);
     }
     return bytes;
 }

@@ -1,6 +1,8 @@
 // The simulation's inside, shared by the files of the solver.
 #pragma once
+#include "server/mpm/body_force.h"
 #include "server/mpm/boundary.h"
+#include "server/mpm/compare.h"
 #include "server/mpm/contact.h"
 #include "server/mpm/fbar.h"
 #include "server/mpm/load.h"
@@ -56,7 +58,9 @@ struct mpm_sim {
     struct mpm_average *averages;    // (n_probes), NULL where no probe averages
     size_t *probe_particle;          // (n_probes) set and id of the particle of a probe at a point
     size_t *probe_set;
-    double *scratch; // (n_particles), where a probe sorts
+    struct mpm_compare *compares;       // (n_probes)
+    struct mpm_body_force *body_forces; // (n_sets), NULL without a body force
+    double *scratch;                    // (n_particles), where a probe sorts
     struct mpm_clockwork c;
     double phase_seconds[MPM_N_PHASES];
 };
@@ -94,6 +98,8 @@ bool mpm_restore_order(struct mpm_sim *sim);
 bool mpm_provide_fbar(struct mpm_sim *sim, enum mpm_fbar_scheme scheme);
 // One field at one particle, as doubles (components).
 void mpm_particle_field(const struct mpm_particles *s, size_t p, enum mpm_field field, double *out);
+// The medium that an error probe's solution is for: that of its body in the last stage.
+struct mpm_medium mpm_probe_medium(const struct mpm_def *def, const struct mpm_probe_def *q);
 // Finds the particles of the probes that follow one.
 void mpm_probes_find_particles(struct mpm_sim *sim);
 // Adds the present values to the running integrals of the probes that average.

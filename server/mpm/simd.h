@@ -371,7 +371,7 @@ MPM_KERNEL mpm_vec mpm_keep(mpm_vec a, mpm_word bits) {
 MPM_KERNEL mpm_vec mpm_load_upper(const double *from) {
 #if MPM_LANES == 8
     const __m512d a = _mm512_load_pd(from);
-    return _mm512_shuffle_f64x2(a, a, 0x00);
+    return _mm512_shuffle_f64x2(a, a, 0x44);
 #else
     return _mm256_load_pd(from);
 #endif

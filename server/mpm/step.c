@@ -63,7 +63,6 @@ static void work_on(const struct mpm_sim *sim, struct mpm_span span, size_t begi
     span.begin = begin;
     span.end = end;
     span.next = next;
-    *result = mpm_nothing_found();
     work(sim, &span, result);
 }
 
@@ -299,6 +298,10 @@ static void particles_to_grid(struct mpm_sim *sim, double dt, bool any_fbar, dou
                               load->force, load->n);
         }
     }
+    for (size_t b = 0; sim->body_forces && b < sim->n_sets; b++) {
+        mpm_body_force_apply(&sim->body_forces[b], &sim->def->body_force, sim->c.time,
+                             &sim->sets[b], &sim->grid, sim->plain);
+    }
     for (size_t k = 0; k < sim->n_rigids; k++) {
         struct mpm_rigid *rigid = &sim->rigids[k];
         memset(rigid->reaction, 0, sizeof rigid->reaction);
@@ -395,6 +398,9 @@ enum mpm_status mpm_step(struct mpm_sim *sim, struct mpm_error *err) {
             sim->c.external_work +=
                 mpm_load_work(&sim->loads[k], &sim->sets[sim->loads[k].def.body]);
         }
+    }
+    for (size_t b = 0; sim->body_forces && b < sim->n_sets; b++) {
+        sim->c.external_work += mpm_body_force_work(&sim->body_forces[b], &sim->sets[b]);
     }
     sim->c.v2_max = found.v2_max;
     sim->c.drift += found.dx_max * sim->grid.inv_h;

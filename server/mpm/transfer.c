@@ -93,6 +93,7 @@ MPM_KERNEL void p2g(const struct mpm_span *span, struct mpm_span_result *result,
             }
         }
     }
+    *result = mpm_nothing_found();
     result->n_runs = t.n_runs;
 }
 

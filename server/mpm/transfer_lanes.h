@@ -967,6 +967,7 @@ MPM_KERNEL bool batch_at(struct batch *b, const struct mpm_span *span, size_t fi
 MPM_KERNEL void p2g(const struct mpm_span *span, struct mpm_span_result *r, const int dim,
                     const enum mpm_basis basis) {
     struct batch b;
+    *r = mpm_nothing_found();
     FOR_BATCHES(&b, span) {
         find_cells(&b, span, dim, basis);
         find_nodes(&b, span->grid, dim, basis);
@@ -1020,6 +1021,7 @@ MPM_KERNEL void g2p(const struct mpm_span *span, struct mpm_span_result *r, cons
     struct batch b;
     struct found found;
     found_nothing(&found);
+    *r = mpm_nothing_found();
     FOR_BATCHES(&b, span) {
         find_cells(&b, span, dim, basis);
         find_nodes(&b, span->grid, dim, basis);
@@ -1044,6 +1046,7 @@ MPM_KERNEL void fbar(const struct mpm_span *span, struct mpm_span_result *r, con
     struct batch b;
     struct found found;
     found_nothing(&found);
+    *r = mpm_nothing_found();
     FOR_BATCHES(&b, span) {
         find_cells(&b, span, dim, basis);
         find_nodes(&b, span->grid, dim, basis);

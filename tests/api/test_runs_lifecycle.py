@@ -383,6 +383,21 @@ def test_accuracy_compares_each_reference(daemon, name):
     daemon.away(name)
 
 
+def test_accuracy_of_an_error_is_the_error(daemon, name):
+    scene = daemon.get("/v1/scenes/hydrostatic-column")
+    error = {"probe": "pressure_error", "at": "end", "value": 0, "tolerance": 0.5, "source": "exact"}
+    cited = {"probe": "energy", "component": "total", "at": 0.05, "tolerance": 1,
+             "value": {"table": "tube_free_radial_oscillation", "column": "a"}}  # fmt: skip
+    daemon.create({**scene, "time": {"end": 0.1}, "references": [error, cited]}, id=name)
+    run = daemon.wait(name, "completed")
+    of_error, of_table = run["accuracy"]
+    assert of_error["value"] == run["probes"]["pressure_error"] > 0
+    assert of_error["relative_error"] == of_error["value"]
+    assert of_table["reference"] == pytest.approx(1.18861967672, rel=1e-12)
+    assert daemon.get(f"/v1/runs/{name}/scene")["references"][1]["value"]["column"] == "a"
+    daemon.away(name)
+
+
 def test_accuracy_is_there_before_its_time_has_come(daemon, name):
     reference = {"probe": "front", "at": 0.05, "value": 1.0, "tolerance": 0.5, "source": "s"}
     daemon.create(water(references=[reference]), id=name, start=False)

@@ -150,13 +150,14 @@ static void advance(struct mpm_sim *sim, double end) {
     }
 }
 
-// RMS of the error of the mean normal stress, over the standard deviation of the FEM's.
-static double pressure_error(const struct mpm_sim *sim) {
+// RMS of the error of the mean normal stress, over the standard deviation of the FEM's, `corner`
+// metres around the singular one left out.
+static double pressure_error(const struct mpm_sim *sim, double corner) {
     double error2 = 0, sum = 0, sum2 = 0, count = 0;
     mpm_field_copy(sim, MPM_FIELD_MEAN_STRESS, buffer);
     for (size_t p = 0; p < n; p++) {
         const double X = x0[2 * p], Y = x0[2 * p + 1], fem = fem_at(def.cell, X, Y);
-        if (hypot(X, Y - 44) >= CORNER && !isnan(fem)) {
+        if (hypot(X, Y - 44) >= corner && !isnan(fem)) {
             error2 += (buffer[p] - fem) * (buffer[p] - fem);
             sum += fem;
             sum2 += fem * fem;
@@ -184,15 +185,17 @@ static double column_error(const struct mpm_sim *sim) {
 }
 
 struct errors {
-    double pressure, column;
+    double pressure, everywhere, column; // pressure without the corner, and with it
 };
 static struct errors measure(const struct mpm_sim *sim) {
-    const struct errors e = {pressure_error(sim), column_error(sim)};
+    const struct errors e = {pressure_error(sim, CORNER), pressure_error(sim, 0),
+                             column_error(sim)};
     if (getenv("FBARD_LONG")) {
         print_message(
-            "h = %g %-8s %-8s cfl %.2f t = %5.1f s: pressure error %.3f, column %+.2f %%\n",
+            "h = %g %-8s %-8s cfl %.2f t = %5.1f s: pressure error %.3f (%.3f with the corner), "
+            "column %+.2f %%\n",
             def.cell, mpm_basis_name(def.basis), mpm_fbar_name(def.settings.fbar.scheme),
-            def.settings.cfl, mpm_time(sim), e.pressure, 100 * e.column);
+            def.settings.cfl, mpm_time(sim), e.pressure, e.everywhere, 100 * e.column);
     }
     return e;
 }
@@ -235,16 +238,19 @@ static void test_cook_pressure_of_fbar(void **state) {
 }
 
 // h = 1 at the paper's time. Algorithm 1 creeps (docs/method.md), so that only its pressure is
-// compared. The standard quadratic B-spline's pressure is off by 0.67 here (and 0.87 at 120 s; 0.57
-// with local damping 0.75; folded walls or not): 1.4 within two cells of the edges, 0.23 away from
-// them. A prototype had shown 1.30, and uGIMP 4.67 where this shows 4.04.
+// compared. The standard quadratic B-spline's pressure is off by 1.33 over all particles, as a
+// prototype's was (1.30), and by 0.67 without those 6 m around the corner (0.87 at 120 s; 0.57 with
+// local damping 0.75; folded walls or not): its noise sits at the edges, 1.4 within two cells of
+// them and 0.23 away from them. uGIMP's is everywhere: 4.65 (a prototype: 4.67) and 4.04.
 static void test_cook_at_h_1(void **state) {
     (void)state;
     if (!getenv("FBARD_LONG")) {
         skip();
     }
     below(3, run(1, MPM_GIMP, MPM_FBAR_OFF, 0.3, 38).pressure);
-    below(0.5, run(1, MPM_BSPLINE2, MPM_FBAR_OFF, 0.3, 38).pressure);
+    const struct errors smooth = run(1, MPM_BSPLINE2, MPM_FBAR_OFF, 0.3, 38);
+    below(0.5, smooth.pressure);
+    below(1, smooth.everywhere);
     for (int basis = MPM_GIMP; basis <= MPM_BSPLINE3; basis++) {
         below(run(1, basis, MPM_FBAR_ZHAO, 0.3, 38).pressure, 0.2);
         below(run(1, basis, MPM_FBAR_ANCHORED, 0.3, 38).pressure, 0.2);
@@ -262,7 +268,7 @@ static void test_cook_does_not_creep_when_anchored(void **state) {
         for (int basis = MPM_GIMP; basis <= MPM_BSPLINE2; basis++) {
             for (int k = 0; k < 3; k++) {
                 struct mpm_sim *sim = create(h, basis, MPM_FBAR_ANCHORED, cfl[k]);
-                for (double t = 60; t <= (h == 2 ? 240 : 120); t += 20) {
+                for (double t = 60; t <= 240; t += 20) {
                     advance(sim, t);
                     const struct errors e = measure(sim);
                     below(fabs(e.column), 0.02);

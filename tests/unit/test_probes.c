@@ -191,6 +191,216 @@ static void test_probe_displacement_follows_its_particle(void **state) {
     }
 }
 
+// With `select`: the mean over the layer that a load would act on.
+static void test_probe_selects_as_a_load_does(void **state) {
+    (void)state;
+    for (int dim = 2; dim <= 3; dim++) {
+        define(dim);
+        struct mpm_probe_def *q = add_probe(MPM_PROBE_MEAN, 1);
+        q->field = MPM_FIELD_POSITION;
+        q->has_select = true;
+        q->select = (struct mpm_load_def){.axis = 0, .max_side = true};
+        q = add_probe(MPM_PROBE_DISPLACEMENT, 0);
+        q->has_select = true;
+        q->select = (struct mpm_load_def){.axis = 1};
+        q = add_probe(MPM_PROBE_MINIMUM, 1); // of the layer, what is in the box too
+        q->field = MPM_FIELD_POSITION;
+        q->has_select = q->has_box = true;
+        q->select = (struct mpm_load_def){.axis = 0, .max_side = true};
+        q->box_min[1] = 0.25, q->box_max[0] = 9, q->box_max[1] = q->box_max[2] = 9;
+        world.bodies[0].velocity = (struct mpm_velocity){.vector = {0, -0.5, 0.25}};
+        struct mpm_sim *sim = create();
+        double x[MPM_MAX_COMPONENTS];
+        mpm_probe_value(sim, 0, x);
+        assert_near(x[0], 1.5 - 1.0 / 32, 1e-14);
+        assert_near(x[1], 0.25, 1e-14);
+        mpm_probe_value(sim, 2, x);
+        assert_near(x[0], 1.5 - 1.0 / 32, 1e-14);
+        assert_near(x[1], 0.25 + 1.0 / 32, 1e-14);
+        for (int k = 0; k < 10; k++) {
+            step(sim);
+        }
+        mpm_probe_value(sim, 1, x);
+        assert_near(x[1], -0.5 * 10 * DT, 1e-13);
+        mpm_free(sim);
+    }
+}
+
+// Errors of a made-up state: the reference is a rigid rotation by a quarter turn, or a table.
+static void test_probe_error_by_every_norm(void **state) {
+    (void)state;
+    define(2);
+    static const double points[] = {0, 1.0 / 32, 0.25, 0.5}, values[] = {0, 1, 8, 16}; // 32 Y
+    for (int norm = 0; norm < MPM_N_NORMS; norm++) {
+        struct mpm_probe_def *q = add_probe(MPM_PROBE_ERROR, 0);
+        q->field = MPM_FIELD_DISPLACEMENT;
+        q->component = -1;
+        q->norm = (enum mpm_norm)norm;
+        q->against.solution =
+            (struct mpm_solution){.kind = MPM_SOLUTION_ROTATION, .rate = M_PI / 2 / DT};
+    }
+    for (int norm = 0; norm < MPM_N_NORMS; norm++) {
+        struct mpm_probe_def *q = add_probe(MPM_PROBE_ERROR, 0);
+        q->field = MPM_FIELD_MEAN_STRESS;
+        q->component = -1;
+        q->norm = (enum mpm_norm)norm;
+        q->against = (struct mpm_against){
+            .is_table = true, .n = 4, .n_axes = 1, .axis = {1}, .points = points, .values = values};
+        if (norm == MPM_NORM_ABSOLUTE) { // only the upper half, without its right end
+            q->has_box = q->has_exclude = true;
+            q->box_min[1] = 0.25, q->box_max[0] = q->box_max[1] = 9;
+            q->scale = 3;
+            q->exclude.min[0] = 0.25;
+            q->exclude.max[0] = q->exclude.max[1] = 9;
+        }
+    }
+    struct mpm_sim *sim = create();
+    struct mpm_particles *s = &sim->sets[0];
+    // Displaced by X, Y instead of by -Y - X, X - Y: off by (2X + Y, 2Y - X), of size sqrt(5) R.
+    double R2 = 0, largest = 0, sum[2] = {0}, error2 = 0, size2 = 0, mean = 0;
+    for (size_t p = 0; p < s->n; p++) {
+        const double X = s->x[mpm_at(p, 2, 0)], Y = s->x[mpm_at(p, 2, 1)];
+        s->x[mpm_at(p, 2, 0)] = 2 * X;
+        s->x[mpm_at(p, 2, 1)] = 2 * Y;
+        R2 += X * X + Y * Y;
+        largest = fmax(largest, hypot(X, Y));
+        sum[0] += -X - Y;
+        sum[1] += X - Y;
+        const double stress = 32 * Y + (X > 0.25 ? 1 : -2);
+        error2 += X > 0.25 ? 1 : 4;
+        size2 += 32 * Y * 32 * Y;
+        mean += 32 * Y;
+        for (int k = 0; k < 3; k++) {
+            s->sigma[mpm_at(p, MPM_SYM(2), k)] = stress;
+        }
+    }
+    const double n = (double)s->n;
+    assert_true(isnan(value(sim, MPM_NORM_L2))); // at t = 0 the reference is no displacement
+    sim->c.time = DT;
+    const double spread = sqrt(2 * R2 / n - (sum[0] * sum[0] + sum[1] * sum[1]) / (n * n));
+    assert_near(value(sim, MPM_NORM_RMS), sqrt(5 * R2 / n) / spread, 1e-12);
+    assert_near(value(sim, MPM_NORM_L2), sqrt(2.5), 1e-12);
+    assert_near(value(sim, MPM_NORM_MAX), sqrt(2.5), 1e-12);
+    assert_near(value(sim, MPM_NORM_ABSOLUTE), sqrt(5 * R2 / n), 1e-12);
+    assert_near(value(sim, MPM_N_NORMS + MPM_NORM_RMS),
+                sqrt(error2 / n) / sqrt(size2 / n - mean * mean / (n * n)), 1e-12);
+    assert_near(value(sim, MPM_N_NORMS + MPM_NORM_L2), sqrt(error2 / size2), 1e-12);
+    assert_near(value(sim, MPM_N_NORMS + MPM_NORM_MAX), 2 / 15.0, 1e-12);
+    assert_near(value(sim, MPM_N_NORMS + MPM_NORM_ABSOLUTE), 3 * 2, 1e-12);
+    mpm_free(sim);
+}
+
+// Of a solution that stands, in the material of the last stage.
+static void test_probe_error_of_a_column(void **state) {
+    (void)state;
+    for (int dim = 2; dim <= 3; dim++) {
+        define(dim);
+        world.def.settings.gravity[1] = -10;
+        world.stages[1] = world.stages[0];
+        static struct mpm_material_def stiff[2];
+        memcpy(stiff, world.materials, sizeof stiff);
+        stiff[0].parameters[1] = 4e4;
+        world.stages[1].materials = stiff;
+        world.def.n_stages = 2;
+        struct mpm_probe_def *q = add_probe(MPM_PROBE_ERROR, 0);
+        q->field = MPM_FIELD_STRESS;
+        q->component = dim + 1; // yy
+        q->against.solution =
+            (struct mpm_solution){.kind = MPM_SOLUTION_COLUMN, .axis = 1, .length = 0.5};
+        q = add_probe(MPM_PROBE_ERROR, 0);
+        q->field = MPM_FIELD_POSITION;
+        q->component = 1;
+        q->norm = MPM_NORM_ABSOLUTE;
+        q->against.solution = world.probes[0].against.solution;
+        struct mpm_sim *sim = create();
+        struct mpm_particles *s = &sim->sets[0];
+        const struct mpm_medium m =
+            mpm_medium_of(stiff[0].model, stiff[0].parameters, world.def.settings.gravity);
+        struct mpm_exact e;
+        mpm_exact_create(&e, &q->against.solution, &m);
+        for (size_t p = 0; p < s->n; p++) {
+            struct mpm_exact_state at;
+            double X[MPM_MAX_DIM] = {0};
+            for (int d = 0; d < dim; d++) {
+                X[d] = s->x[mpm_at(p, dim, d)];
+            }
+            mpm_exact_state(&e, X, X, 0, dim, &at);
+            s->x[mpm_at(p, dim, 1)] += at.u[1];
+            s->sigma[mpm_at(p, MPM_SYM(dim), 1)] = -1000 * 10 * (0.5 - X[1]);
+        }
+        assert_near(value(sim, 0), 0, 1e-12);
+        assert_near(value(sim, 1), 0, 1e-15);
+        mpm_free(sim);
+    }
+}
+
+// The body force of a manufactured solution acts on the matter that began at a place; a uniform one
+// is gravity but for the potential energy.
+static void test_body_force_moves_as_gravity_does(void **state) {
+    (void)state;
+    for (int dim = 2; dim <= 3; dim++) {
+        struct mpm_balance b[2];
+        double x[2];
+        for (int way = 0; way < 2; way++) {
+            define(dim);
+            add_probe(MPM_PROBE_EXTENT, -1)->max_side = true;
+            world.bodies[0].velocity = (struct mpm_velocity){.vector = {0.5, 0, 0}};
+            double *g = way ? world.def.settings.gravity : world.def.body_force.vector;
+            g[0] = 3, g[1] = -10;
+            world.def.body_force.kind = way ? MPM_BODY_FORCE_NONE : MPM_BODY_FORCE_UNIFORM;
+            struct mpm_sim *sim = create();
+            struct mpm_estimate estimate;
+            mpm_estimate(&world.def, &estimate);
+            assert_near((double)estimate.bytes, (double)mpm_bytes(sim), 64); // whole cache lines
+            for (int k = 0; k < 50; k++) {
+                step(sim);
+            }
+            mpm_balance(sim, &b[way]);
+            x[way] = value(sim, 0);
+            mpm_free(sim);
+        }
+        assert_near(x[0], x[1], 1e-13);
+        assert_near(b[0].kinetic_energy, b[1].kinetic_energy, 1e-12 * b[1].kinetic_energy);
+        assert_near(b[0].external_work, b[1].external_work, 1e-11 * fabs(b[1].external_work));
+        assert_near(b[0].potential_energy, 0, 0);
+    }
+}
+
+static void test_body_force_of_a_vortex_follows_its_matter(void **state) {
+    (void)state;
+    define(2);
+    world.def.n_bodies = 1;
+    world.def.body_force = (struct mpm_body_force_def){
+        .kind = MPM_BODY_FORCE_SOLUTION,
+        .solution = {.kind = MPM_SOLUTION_VORTEX,
+                     .inner = 0.1, // about the body's corner: the sum of its forces is not 0
+                     .outer = 0.4,
+                     .amplitude = 0.1,
+                     .period = 1}};
+    struct mpm_sim *sim = create();
+    for (int k = 0; k < 3; k++) { // F = ma of the whole body
+        double force[2] = {0};
+        struct mpm_balance before, after;
+        mpm_balance(sim, &before);
+        const struct mpm_particles *s = &sim->sets[0];
+        const struct mpm_medium m = mpm_medium_of(s->material, s->parameters, (double[3]){0});
+        for (size_t p = 0; p < s->n; p++) {
+            const double X[3] = {s->x0[mpm_at(p, 2, 0)], s->x0[mpm_at(p, 2, 1)], 0};
+            double b[3];
+            mpm_exact_force(&world.def.body_force.solution, &m, X, mpm_time(sim), 2, b);
+            force[0] += 1000 * s->V0[p] * b[0];
+            force[1] += 1000 * s->V0[p] * b[1];
+        }
+        step(sim);
+        mpm_balance(sim, &after);
+        for (int d = 0; d < 2; d++) {
+            assert_near(after.momentum[d] - before.momentum[d], DT * force[d], 1e-12);
+            assert_true(fabs(DT * force[d]) > 1e-6);
+        }
+    }
+    mpm_free(sim);
+}
+
 static void test_probe_folds_a_field(void **state) {
     (void)state;
     for (int dim = 2; dim <= 3; dim++) {
@@ -441,6 +651,11 @@ int main(int argc, char **argv) {
         cmocka_unit_test(test_probe_extent_is_the_outermost_particle),
         cmocka_unit_test(test_probe_extent_takes_a_quantile),
         cmocka_unit_test(test_probe_displacement_follows_its_particle),
+        cmocka_unit_test(test_probe_selects_as_a_load_does),
+        cmocka_unit_test(test_probe_error_by_every_norm),
+        cmocka_unit_test(test_probe_error_of_a_column),
+        cmocka_unit_test(test_body_force_moves_as_gravity_does),
+        cmocka_unit_test(test_body_force_of_a_vortex_follows_its_matter),
         cmocka_unit_test(test_probe_folds_a_field),
         cmocka_unit_test(test_probe_energy_and_momentum_are_the_balance),
         cmocka_unit_test(test_balance_of_work_in_free_fall),

@@ -1,5 +1,6 @@
 // Scenes: what is refused (by pointer and code), what is filled in, what the definition then says,
 // what may be patched, and that schema and documentation follow the table of keys.
+#include <math.h>
 #include <setjmp.h>
 #include <stdarg.h>
 #include <stddef.h>
@@ -708,6 +709,204 @@ static void test_scene_reads_rigid_bodies(void **state) {
     scene_free(scene);
 }
 
+// ---- Solutions, tables, errors ------------------------------------------------------------------
+
+#define VORTEX "\"inner\":0.1,\"outer\":0.4,\"amplitude\":1,\"period\":2"
+#define ERROR_OF(text) "{\"probes\":{\"e\":{\"kind\":\"error\"," text "}}}"
+#define AGAINST(text)                                                                              \
+    ERROR_OF("\"field\":\"displacement\",\"body\":\"ball\",\"against\":{" text "}")
+#define ONLY_BALL "\"bodies\":{\"pool\":null},\"materials\":{\"water\":null}"
+
+static void test_scene_reads_solutions(void **state) {
+    (void)state;
+    struct scene *scene = create(
+        "{\"materials\":{\"water\":null},"
+        "\"body_force\":{\"vortex\":{\"center\":[2,3]," VORTEX "}},"
+        "\"bodies\":{\"pool\":null,\"ball\":{\"velocity\":{\"tube\":{\"inner\":1,\"outer\":2,"
+        "\"rate\":3}}}},"
+        "\"probes\":{\"e\":{\"kind\":\"error\",\"field\":\"stress\",\"component\":\"yx\",\"norm\":"
+        "\"l2\",\"against\":{\"lame\":{\"inner\":1,\"outer\":2,\"pressure\":5}},\"exclude\":{"
+        "\"disk\":{\"center\":[2,3],\"radius\":0.1}}},"
+        "\"f\":{\"kind\":\"error\",\"field\":\"mean_stress\",\"against\":{\"column\":{\"axis\":"
+        "\"y\",\"length\":4}}},"
+        "\"s\":{\"kind\":\"displacement\",\"select\":{\"extreme\":\"+r\",\"center\":[2,3]}}}}");
+    const struct mpm_def *def = scene_def(scene);
+    assert_int_equal(def->body_force.kind, MPM_BODY_FORCE_SOLUTION);
+    const struct mpm_solution *q = &def->body_force.solution;
+    assert_int_equal(q->kind, MPM_SOLUTION_VORTEX);
+    assert_true(q->centre[0] == 2 && q->centre[1] == 3 && q->inner == 0.1 && q->outer == 0.4 &&
+                q->amplitude == 1 && q->period == 2);
+    assert_int_equal(def->bodies[0].velocity.kind, MPM_VELOCITY_SOLUTION);
+    assert_true(def->bodies[0].velocity.solution.rate == 3);
+    const struct mpm_probe_def *e = &def->probes[2], *f = &def->probes[3], *s = &def->probes[4];
+    assert_true(e->kind == MPM_PROBE_ERROR && e->norm == MPM_NORM_L2 && e->component == 2);
+    assert_true(e->against.solution.kind == MPM_SOLUTION_LAME &&
+                e->against.solution.pressure == 5 && e->has_exclude);
+    assert_true(f->norm == MPM_NORM_RMS && f->component == -1 && f->against.solution.axis == 1 &&
+                f->against.solution.length == 4 && f->against.solution.from == 0);
+    assert_true(s->has_select && s->select.round && s->select.max_side && s->body == 0);
+    scene_free(scene);
+    scene = create("{\"body_force\":[0,0]}");
+    assert_int_equal(scene_def(scene)->body_force.kind, MPM_BODY_FORCE_NONE);
+    scene_free(scene);
+    scene = create("{\"body_force\":[0,1]}");
+    assert_int_equal(scene_def(scene)->body_force.kind, MPM_BODY_FORCE_UNIFORM);
+    scene_free(scene);
+}
+
+// A body 96 m wide, so that Cook's table has points in it.
+#define WIDE                                                                                       \
+    "\"domain\":{\"min\":[0,0],\"max\":[60,60]},\"cell\":2,\"walls\":null,\"bodies\":{\"pool\":"   \
+    "null,"                                                                                        \
+    "\"ball\":{\"shape\":{\"disk\":{\"center\":[24,40],\"radius\":5}}}}"
+#define COOK "\"against\":\"cook_base_log_particles_h1\""
+
+static void test_scene_reads_tables(void **state) {
+    (void)state;
+    struct scene *scene = create(
+        "{" WIDE ",\"probes\":{\"e\":{\"kind\":\"error\",\"field\":\"displacement\"," COOK "}},"
+        "\"references\":[{\"probe\":\"energy\",\"component\":\"total\",\"at\":0.25,\"tolerance\":1,"
+        "\"value\":{\"table\":\"tube_free_radial_oscillation\",\"column\":\"a\"}},"
+        "{\"probe\":\"energy\",\"component\":\"total\",\"at\":\"end\",\"tolerance\":1,"
+        "\"value\":{\"table\":\"footing_rough_W5_D5_NB20\",\"column\":\"q_over_su\",\"at\":"
+        "0.00015}}]}");
+    const struct mpm_probe_def *e = &scene_def(scene)->probes[2];
+    assert_true(e->against.is_table && e->against.n == 5776 && e->against.n_axes == 2);
+    assert_true(e->against.points[0] == 0.25 && e->against.points[3] == 0.75);
+    assert_true(fabs(e->against.values[3] - 0.000644) < 1e-6);
+    size_t n;
+    const struct scene_reference *references = scene_references(scene, &n);
+    assert_int_equal(n, 2);
+    assert_true(fabs(references[0].value - 1.5951430448) < 1e-9);
+    assert_true(fabs(references[1].value - (1.129444 + 2.218599) / 2) < 1e-4); // 5 digits
+    scene_free(scene);
+}
+
+static void test_scene_refuses_bad_errors(void **state) {
+    (void)state;
+    assert_fault(ERROR_OF("\"field\":\"velocity\""), "/probes/e/against", "required");
+    assert_fault(ERROR_OF("\"against\":\"cook_base_log_particles_h1\""), "/probes/e/field",
+                 "required");
+    assert_fault(ERROR_OF("\"field\":\"velocity\",\"against\":3"), "/probes/e/against", "type");
+    assert_fault(ERROR_OF("\"field\":\"mean_stress\",\"against\":\"cook_base_log_particles\""),
+                 "/probes/e/against", "choice");
+    assert_fault(ERROR_OF("\"field\":\"velocity\"," COOK), "/probes/e/against", "conflict");
+    assert_fault(ERROR_OF("\"field\":\"mean_stress\",\"against\":\"footing_rough_W5_D5_NB20\""),
+                 "/probes/e/against", "conflict");
+    assert_fault(AGAINST("\"vortx\":{}"), "/probes/e/against/vortx", "unknown_key");
+    assert_fault(AGAINST("\"vortex\":{\"inner\":1,\"outer\":2,\"period\":1}"),
+                 "/probes/e/against/vortex/amplitude", "required");
+    assert_fault(AGAINST("\"lame\":{\"inner\":2,\"outer\":2,\"pressure\":1}"),
+                 "/probes/e/against/lame/outer", "range");
+    assert_fault(AGAINST("\"lame\":{\"inner\":0,\"outer\":2,\"pressure\":1}"),
+                 "/probes/e/against/lame/inner", "range");
+    assert_fault(AGAINST("\"cylinder\":{\"inner\":1,\"outer\":2,\"pressure\":1e6}"),
+                 "/probes/e/against/cylinder/pressure", "range");
+    assert_fault(AGAINST("\"taylor_green\":{\"wavelength\":2,\"speed\":1}"), "/probes/e/field",
+                 "conflict"); // it tells velocities
+    assert_fault(ERROR_OF("\"field\":\"velocity\",\"body\":\"ball\",\"against\":{\"taylor_green\":"
+                          "{\"wavelength\":2,\"speed\":1}}"),
+                 "/probes/e/against/taylor_green", "conflict"); // of a fluid
+    assert_fault(
+        ERROR_OF("\"field\":\"displacement\",\"body\":\"pool\",\"against\":{\"vortex\":{" VORTEX
+                 "}}"),
+        "/probes/e/against/vortex", "conflict"); // of rubber
+    assert_fault(ERROR_OF("\"field\":\"displacement\",\"against\":{\"vortex\":{" VORTEX "}}"),
+                 "/probes/e/body", "reference");
+    assert_fault("{\"gravity\":[0,0],\"probes\":{\"e\":{\"kind\":\"error\",\"field\":\"velocity\","
+                 "\"body\":\"pool\",\"against\":{\"ritter\":{\"gate\":2,\"depth\":1}}}}}",
+                 "/probes/e/against/ritter", "conflict");
+    assert_fault(
+        "{\"materials\":{\"water\":{\"bulk_modulus\":9000}},\"probes\":{\"e\":{\"kind\":"
+        "\"error\",\"field\":\"velocity\",\"body\":\"pool\",\"against\":{\"column\":{\"axis\":"
+        "\"y\",\"length\":1}}}}}",
+        "/probes/e/against/column/length", "range");
+    assert_fault(AGAINST("\"mode\":{\"axis\":\"z\",\"length\":1,\"amplitude\":1}"),
+                 "/probes/e/against/mode/axis", "dimension");
+    assert_fault(ERROR_OF("\"field\":\"displacement\",\"component\":\"xx\"," COOK),
+                 "/probes/e/component", "choice");
+    assert_fault(ERROR_OF("\"field\":\"mean_stress\",\"component\":\"x\"," COOK),
+                 "/probes/e/component", "conflict");
+    assert_fault(ERROR_OF("\"field\":\"mean_stress\",\"norm\":\"L2\"," COOK), "/probes/e/norm",
+                 "choice");
+    assert_fault("{\"probes\":{\"energy\":{\"norm\":\"l2\"}}}", "/probes/energy/norm", "conflict");
+    assert_fault(
+        "{\"probes\":{\"front\":{\"exclude\":{\"disk\":{\"center\":[0,0],\"radius\":1}}}}}",
+        "/probes/front/exclude", "conflict");
+    // No particle is left to compare: out of the table, the box, or all excluded.
+    assert_fault(
+        "{\"domain\":{\"min\":[0,-40]},\"cell\":2,\"walls\":null,\"bodies\":{\"pool\":null,"
+        "\"ball\":{\"shape\":{\"disk\":{\"center\":[2,-30],\"radius\":2}}}},"
+        "\"probes\":{\"e\":{\"kind\":\"error\",\"field\":\"mean_stress\"," COOK "}}}",
+        "/probes/e", "empty");
+    assert_fault("{" WIDE ",\"probes\":{\"e\":{\"kind\":\"error\",\"field\":\"mean_stress\"," COOK
+                 ",\"box\":{\"min\":[0,0],\"max\":[1,1]}}}}",
+                 "/probes/e", "empty");
+    assert_fault("{" WIDE ",\"probes\":{\"e\":{\"kind\":\"error\",\"field\":\"mean_stress\"," COOK
+                 ",\"exclude\":{\"disk\":{\"center\":[24,40],\"radius\":6}}}}}",
+                 "/probes/e", "empty");
+}
+
+static void test_scene_refuses_bad_selections(void **state) {
+    (void)state;
+#define SELECT(text)                                                                               \
+    "{\"probes\":{\"d\":{\"kind\":\"displacement\",\"body\":\"ball\",\"select\":{" text "}}}}"
+    scene_free(create(SELECT("\"extreme\":\"+y\"")));
+    assert_fault(SELECT(""), "/probes/d/select", "required");
+    assert_fault(SELECT("\"extreme\":\"+z\""), "/probes/d/select/extreme", "dimension");
+    assert_fault(SELECT("\"extreme\":\"-r\""), "/probes/d/select/center", "required");
+    assert_fault(SELECT("\"box\":{\"min\":[0,0],\"max\":[1,1]}"), "/probes/d/select", "empty");
+    assert_fault("{\"probes\":{\"d\":{\"kind\":\"displacement\",\"select\":{\"extreme\":\"+y\"}}}}",
+                 "/probes/d/body", "reference"); // there are two
+    assert_fault("{\"probes\":{\"d\":{\"kind\":\"displacement\",\"body\":\"ball\",\"at\":[2,3],"
+                 "\"select\":{\"extreme\":\"+y\"}}}}",
+                 "/probes/d/select", "conflict");
+    assert_fault("{\"probes\":{\"d\":{\"kind\":\"displacement\"}}}", "/probes/d/at", "required");
+    assert_fault("{\"probes\":{\"front\":{\"select\":{\"extreme\":\"+y\"}}}}",
+                 "/probes/front/select", "conflict");
+}
+
+static void test_scene_refuses_bad_body_forces(void **state) {
+    (void)state;
+    assert_fault("{\"body_force\":[0]}", "/body_force", "length");
+    assert_fault("{\"body_force\":7}", "/body_force", "type");
+    assert_fault("{\"body_force\":{}}", "/body_force", "count");
+    assert_fault("{\"body_force\":{\"tube\":{\"inner\":1,\"outer\":2,\"rate\":3}}}",
+                 "/body_force/tube", "unknown_key");
+    assert_fault("{\"body_force\":{\"vortex\":{" VORTEX "}}}", "/body_force/vortex",
+                 "conflict"); // the pool is of water
+    assert_fault("{" ONLY_BALL
+                 ",\"body_force\":{\"vortex\":{\"inner\":2,\"outer\":1,\"amplitude\":1,"
+                 "\"period\":1}}}",
+                 "/body_force/vortex/outer", "range");
+    assert_fault("{\"bodies\":{\"ball\":{\"velocity\":{\"vortex\":{\"inner\":2,\"outer\":1,"
+                 "\"amplitude\":1,\"period\":1}}}}}",
+                 "/bodies/ball/velocity/vortex/outer", "range");
+    assert_fault("{\"bodies\":{\"ball\":{\"velocity\":{\"lame\":{\"inner\":1,\"outer\":2,"
+                 "\"pressure\":1}}}}}",
+                 "/bodies/ball/velocity/lame", "unknown_key");
+}
+
+static void test_scene_refuses_bad_citations(void **state) {
+    (void)state;
+#define CITE(text)                                                                                 \
+    "{\"references\":[{\"probe\":\"front\",\"at\":0.5,\"tolerance\":1,\"value\":{" text "}}]}"
+#define TUBE "\"table\":\"tube_free_radial_oscillation\""
+    scene_free(create(CITE(TUBE ",\"column\":\"b\"")));
+    assert_fault(CITE("\"column\":\"b\""), "/references/0/value/table", "required");
+    assert_fault(CITE(TUBE), "/references/0/value/column", "required");
+    assert_fault(CITE("\"table\":\"tube\",\"column\":\"b\""), "/references/0/value/table",
+                 "choice");
+    assert_fault(CITE(TUBE ",\"column\":\"d\""), "/references/0/value/column", "choice");
+    assert_fault(CITE(TUBE ",\"column\":\"b\",\"at\":1e6"), "/references/0/value/at", "range");
+    assert_fault(CITE(TUBE ",\"column\":\"b\",\"at\":\"end\""), "/references/0/value/at", "type");
+    assert_fault(CITE(TUBE ",\"column\":\"b\",\"row\":3"), "/references/0/value/row",
+                 "unknown_key");
+    assert_fault(
+        "{\"references\":[{\"probe\":\"front\",\"at\":0.5,\"tolerance\":1,\"value\":\"1\"}]}",
+        "/references/0/value", "type");
+}
+
 #define RIGID(text) "{\"rigid_bodies\":{\"foot\":{" text "}}}"
 #define CONTACT(text) RIGID(FOOT_SHAPE ",\"contact\":{" text "}")
 
@@ -1413,6 +1612,12 @@ int main(int argc, char **argv) {
         cmocka_unit_test(test_scene_refuses_bad_loads),
         cmocka_unit_test(test_scene_reads_rigid_bodies),
         cmocka_unit_test(test_scene_refuses_bad_rigid_bodies),
+        cmocka_unit_test(test_scene_reads_solutions),
+        cmocka_unit_test(test_scene_reads_tables),
+        cmocka_unit_test(test_scene_refuses_bad_errors),
+        cmocka_unit_test(test_scene_refuses_bad_selections),
+        cmocka_unit_test(test_scene_refuses_bad_body_forces),
+        cmocka_unit_test(test_scene_refuses_bad_citations),
         cmocka_unit_test(test_scene_reads_plastic_materials),
         cmocka_unit_test(test_scene_reports_the_solver_s_faults_with_its_own),
         cmocka_unit_test(test_scene_refuses_what_no_run_can_give),
