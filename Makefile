@@ -66,10 +66,11 @@ levels = $(foreach level,$(LEVELS),$(patsubst %.c,$(B)/obj/%.$(level).o,$(1)))
 lanes = $(call obj,$(1)) $(call levels,$(1))
 $(B)/obj/server/mpm/kernels.o: ALL_CFLAGS += $(if $(LEVELS),-DMPM_HAS_LANES)
 # Written in vectors: what the compiler would vectorise or unroll besides is scalar for a reason.
-$(call levels,$(LANES_SRC)): ALL_CFLAGS += -O2 -fno-tree-vectorize -fno-tree-slp-vectorize
+$(call levels,$(LANES_SRC)): ALL_CFLAGS += $(if $(filter asan tsan debug coverage,$(VARIANT)),-O1,-O2) \
+	-fno-tree-vectorize -fno-tree-slp-vectorize
 
 .PHONY: all programs deps deps-long libmpm demo check check-all check-layers check-unit check-physics check-api \
-	check-cli check-loss check-asan check-clang check-long bench-recording install uninstall format clean help
+	check-cli check-loss check-asan check-clang unit-programs check-long bench bench-solver bench-peer bench-recording install uninstall format clean help
 .DELETE_ON_ERROR:
 .SECONDARY:
 
@@ -146,7 +147,7 @@ $(B)/tests/%: $(B)/obj/tests/%.o $(SERVER_OBJ) $(call obj,$(PROTO_SRC)) $(B)/lib
 	@mkdir -p $(@D)
 	$(Q)$(CC) $(ALL_LDFLAGS) -pthread $(OPENMP) $^ $(call pc_libs,$(SERVER_LIBS) cmocka) -lm -o $@
 
-$(B)/bench: $(B)/obj/tests/bench/bench.o $(B)/libmpm.a
+$(B)/bench-solver: $(B)/obj/bench/solver.o $(B)/libmpm.a
 	$(call say,LD,$@)
 	$(Q)$(CC) $(ALL_LDFLAGS) $(OPENMP) $^ -lm -o $@
 
@@ -178,7 +179,10 @@ check-all: all
 check-layers: all
 	$(Q)tests/layers.sh
 
-check-unit: $(UNIT) ## cmocka tests of every module
+LEFT_OUT = # names of unit tests that are not run
+UNIT_RUN = $(filter-out $(LEFT_OUT:%=$(B)/tests/unit/test_%),$(UNIT))
+unit-programs: $(UNIT_RUN)
+check-unit: $(UNIT_RUN) ## cmocka tests of every module
 	$(Q)set -e; for t in $^; do echo "== $$t"; $$t; done
 
 check-physics: $(PHYSICS) ## the solver against exact solutions and published values
@@ -201,18 +205,29 @@ $(B)/tests/failing.so: tests/loss/failing.c
 check-loss: all $(B)/tests/failing.so ## kills, failing disks, recorders that stall: nothing is lost
 	$(Q)FBARD=$(CURDIR)/$(B)/fbard FBAR=$(CURDIR)/$(B)/fbar FAILING=$(CURDIR)/$(B)/tests/failing.so $(PYTEST) -s tests/loss
 
-# The same unit and API tests under AddressSanitizer and UBSan.
-check-asan:
-	$(Q)$(MAKE) --no-print-directory -j$$(nproc) VARIANT=asan build/asan/fbard build/asan/fbar programs
-	$(Q)$(MAKE) --no-print-directory VARIANT=asan check-unit
-	$(Q)FBARD=$(CURDIR)/build/asan/fbard FBAR=$(CURDIR)/build/asan/fbar $(PYTEST) tests/api
-
+# The same tests under AddressSanitizer and UBSan. `make check` leaves out what takes long there: the programs that
+# step many variants through the same code, and the API but for requests that are wrong; `make check-long` has it all.
+ASAN_SLOW = $(if $(FBARD_LONG),,contact state boundary fbar)
+ASAN_API = $(if $(FBARD_LONG),tests/api,$(wildcard tests/api/test_requests_*.py tests/api/test_runs_config.py))
+check-asan: ## unit and API tests with sanitizers
+	$(Q)$(MAKE) --no-print-directory -j$$(nproc) VARIANT=asan LEFT_OUT="$(ASAN_SLOW)" \
+	  build/asan/fbard build/asan/fbar unit-programs
+	$(Q)$(MAKE) --no-print-directory VARIANT=asan LEFT_OUT="$(ASAN_SLOW)" check-unit
+	$(Q)FBARD=$(CURDIR)/build/asan/fbard FBAR=$(CURDIR)/build/asan/fbar $(PYTEST) $(ASAN_API)
 check-clang: ## warnings and unit tests with clang 14
 	$(Q)$(MAKE) --no-print-directory CC=clang-14 VARIANT=clang OPENMP=-fopenmp=libomp CFLAGS=-Werror \
 	  build/clang/fbard build/clang/fbar check-unit
 
 check-long: deps-long ## the longer verification: minutes to hours
 	@FBARD_LONG=1 $(MAKE) --no-print-directory check-all check-clang
+
+bench: bench-solver bench-recording ## speed: the solver's kernels, then what recording costs
+
+bench-solver: $(B)/bench-solver ## kernels against the plain ones, ratios and growth; JSON in build/bench.json
+	$(Q)$< --json build/bench.json $(BENCH)
+
+bench-peer: ## how to run the same block problem with another code
+	@cat docs/peers.md
 
 bench-recording: all ## what journal and recording cost a run, and how fast fbar records
 	$(Q)FBARD=$(CURDIR)/$(B)/fbard FBAR=$(CURDIR)/$(B)/fbar $(PYTHON) bench/recording.py

@@ -232,40 +232,64 @@ static void friction(struct mpm_rigid *rigid, const struct mpm_particles *s, siz
     }
 }
 
+// Whether a particle of a tile can be within the body's `distance`, or has been in the step before.
+// Since the last sort none has drifted by a whole cell, nor moves by one in a step; nor does the
+// body, or all may touch it.
+static bool may_touch(const struct mpm_rigid *rigid, const struct mpm_grid *g,
+                      const struct mpm_tile *tile, double dt) {
+    const double reach = rigid->def.distance;
+    int place[MPM_MAX_DIM];
+    if (mpm_rigid_speed(&rigid->def, g->dim) * dt > g->h) {
+        return true;
+    }
+    mpm_grid_block_place(g, tile->block, place);
+    for (int d = 0; d < g->dim; d++) {
+        // A stencil begins at most 1.5 cells before its particle (cubic B-splines), or in its cell.
+        const double from = g->origin[d] + (place[d] * MPM_EDGE - 2) * g->h - rigid->offset[d];
+        const double to = from + (MPM_EDGE + 6) * g->h;
+        if (to < rigid->min[d] - reach || from > rigid->max[d] + reach) {
+            return false;
+        }
+    }
+    return true;
+}
+
 void mpm_contact_forces(struct mpm_rigid *rigid, const struct mpm_kernels *kernels,
-                        struct mpm_particles *s, struct mpm_grid *grid, double dt) {
+                        struct mpm_particles *s, const struct mpm_order *order,
+                        struct mpm_grid *grid, double dt) {
     const int dim = s->dim;
     uint32_t particle[BATCH];
     double force[BATCH * MPM_MAX_DIM];
     size_t n = 0;
-    for (size_t p = 0; p <= s->n; p++) {
-        if (n == BATCH || (p == s->n && n > 0)) {
-            kernels->force(&(struct mpm_span){.s = s, .grid = grid}, particle, force, n);
-            n = 0;
-        }
-        if (p == s->n) {
-            break;
-        }
-        double normal[MPM_MAX_DIM], drag[MPM_MAX_DIM] = {0};
-        const double d = distance_within(rigid, s, p, rigid->def.distance, normal);
-        if (!(d < rigid->def.distance)) {
-            if (rigid->anchor) {
-                rigid->anchor[(s->first_id + s->id[p]) * (size_t)dim] = INFINITY;
+    for (size_t t = 0; t < order->n_tiles; t++) {
+        const struct mpm_tile *tile = &order->tile[t];
+        const bool near = may_touch(rigid, grid, tile, dt);
+        for (size_t p = tile->begin; near && p < tile->end; p++) {
+            double normal[MPM_MAX_DIM], drag[MPM_MAX_DIM] = {0};
+            const double d = distance_within(rigid, s, p, rigid->def.distance, normal);
+            if (!(d < rigid->def.distance)) {
+                if (rigid->anchor) {
+                    rigid->anchor[(s->first_id + s->id[p]) * (size_t)dim] = INFINITY;
+                }
+                continue;
             }
-            continue;
+            const double push = mpm_barrier_pressure(&rigid->def, d) * area_of(s, p);
+            if (rigid->anchor) {
+                friction(rigid, s, p, normal, push, dt, drag);
+            }
+            particle[n] = (uint32_t)p;
+            for (int e = 0; e < dim; e++) {
+                const double f = push * normal[e] - drag[e];
+                force[n * (size_t)dim + (size_t)e] = f;
+                rigid->reaction[e] -= f;
+            }
+            if (++n == BATCH) {
+                kernels->force(&(struct mpm_span){.s = s, .grid = grid}, particle, force, n);
+                n = 0;
+            }
         }
-        const double push = mpm_barrier_pressure(&rigid->def, d) * area_of(s, p);
-        if (rigid->anchor) {
-            friction(rigid, s, p, normal, push, dt, drag);
-        }
-        particle[n] = (uint32_t)p;
-        for (int e = 0; e < dim; e++) {
-            const double f = push * normal[e] - drag[e];
-            force[n * (size_t)dim + (size_t)e] = f;
-            rigid->reaction[e] -= f;
-        }
-        n++;
     }
+    kernels->force(&(struct mpm_span){.s = s, .grid = grid}, particle, force, n);
 }
 
 // Whether particle p was too near or inside, and has been put back.
@@ -298,10 +322,15 @@ static bool put_back(struct mpm_rigid *rigid, struct mpm_particles *s, size_t p,
     return true;
 }
 
-void mpm_contact_keep_out(struct mpm_rigid *rigid, struct mpm_particles *s, double dt,
+void mpm_contact_keep_out(struct mpm_rigid *rigid, struct mpm_particles *s,
+                          const struct mpm_order *order, const struct mpm_grid *grid, double dt,
                           struct mpm_span_result *found) {
-    for (size_t p = 0; p < s->n; p++) {
-        for (int k = 0; k < TRIES && put_back(rigid, s, p, dt, found); k++) {
+    for (size_t t = 0; t < order->n_tiles; t++) {
+        const struct mpm_tile *tile = &order->tile[t];
+        const bool near = may_touch(rigid, grid, tile, dt);
+        for (size_t p = tile->begin; near && p < tile->end; p++) {
+            for (int k = 0; k < TRIES && put_back(rigid, s, p, dt, found); k++) {
+            }
         }
     }
 }

@@ -1,6 +1,6 @@
 // Barrier contact with rigid bodies (docs/method.md section 9).
 #pragma once
-#include "server/mpm/particles.h"
+#include "server/mpm/order.h"
 #include "server/mpm/transfer.h"
 
 struct mpm_rigid {
@@ -30,12 +30,15 @@ double mpm_shape_distance(const struct mpm_shape *shape, const double *x, int di
 double mpm_barrier_pressure(const struct mpm_rigid_def *def, double d);
 
 // With the particles at x^n: contact and friction forces of one body's particles to the grid, and
-// their sum onto rigid->reaction (which the caller has zeroed).
+// their sum onto rigid->reaction (which the caller has zeroed). Tiles that are too far from the body
+// for any of their particles are passed by.
 void mpm_contact_forces(struct mpm_rigid *rigid, const struct mpm_kernels *kernels,
-                        struct mpm_particles *s, struct mpm_grid *grid, double dt);
+                        struct mpm_particles *s, const struct mpm_order *order,
+                        struct mpm_grid *grid, double dt);
 // With the particles at x^{n+1} and the rigid body moved: none stays behind the surface. A particle
 // that a step has carried deeper than the barrier can answer is put back onto its innermost
 // distance and loses its velocity into the body; the impulse is part of the reaction. What this
 // changes of the particles' bounds, largest speed and displacement goes into `found`.
-void mpm_contact_keep_out(struct mpm_rigid *rigid, struct mpm_particles *s, double dt,
+void mpm_contact_keep_out(struct mpm_rigid *rigid, struct mpm_particles *s,
+                          const struct mpm_order *order, const struct mpm_grid *grid, double dt,
                           struct mpm_span_result *found);

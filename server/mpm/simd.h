@@ -70,8 +70,8 @@ MPM_KERNEL mpm_vec mpm_abs(mpm_vec a) {
 MPM_KERNEL mpm_vec mpm_sqrt(mpm_vec a) {
     return sqrt(a);
 }
-MPM_KERNEL mpm_vec mpm_trunc(mpm_vec a) { // |a| < 2^63; trunc would be a call without SSE 4.1
-    return (double)(int64_t)a;
+MPM_KERNEL mpm_vec mpm_trunc(mpm_vec a) { // trunc would be a call without SSE 4.1
+    return fabs(a) < 0x1p52 ? copysign((double)(int64_t)a, a) : a;
 }
 MPM_KERNEL mpm_vec mpm_floor(mpm_vec a) {
     return floor(a);

@@ -238,7 +238,7 @@ static void move_rigid_bodies(struct mpm_sim *sim, double dt, struct mpm_span_re
         struct mpm_span_result pushed = *found;
         pushed.dx_max = 0;
         for (size_t b = 0; b < sim->n_sets; b++) {
-            mpm_contact_keep_out(rigid, &sim->sets[b], dt, &pushed);
+            mpm_contact_keep_out(rigid, &sim->sets[b], &sim->orders[b], &sim->grid, dt, &pushed);
         }
         pushed.dx_max += found->dx_max;
         *found = pushed;
@@ -306,7 +306,7 @@ static void particles_to_grid(struct mpm_sim *sim, double dt, bool any_fbar, dou
         struct mpm_rigid *rigid = &sim->rigids[k];
         memset(rigid->reaction, 0, sizeof rigid->reaction);
         for (size_t b = 0; rigid->active && b < sim->n_sets; b++) {
-            mpm_contact_forces(rigid, sim->plain, &sim->sets[b], &sim->grid, dt);
+            mpm_contact_forces(rigid, sim->plain, &sim->sets[b], &sim->orders[b], &sim->grid, dt);
         }
     }
     if (sim->n_loads + sim->n_rigids > 0) {

@@ -128,6 +128,8 @@ static void step_with_affine_velocity(struct mpm_sim *sim, const double *A) {
     struct mpm_particles *s = &sim->sets[0];
     const int dim = g->dim;
     const enum mpm_fbar_scheme scheme = sim->c.now.fbar.scheme;
+    g->fbar_stride = mpm_fbar_scalars(scheme);
+    assert_true(mpm_sort(sim)); // which may give nodes other places
     FOR_NODES(g, i) {
         int place[MPM_MAX_DIM];
         node_place(g, i, place);
@@ -139,8 +141,6 @@ static void step_with_affine_velocity(struct mpm_sim *sim, const double *A) {
             }
         }
     }
-    g->fbar_stride = mpm_fbar_scalars(scheme);
-    assert_true(mpm_sort(sim));
     const size_t n_nodes = g->n_slots * (size_t)MPM_BLOCK_NODES(dim);
     memset(g->node, 0, n_nodes * MPM_NODE * sizeof *g->node);
     memset(g->fbar, 0, n_nodes * (size_t)g->fbar_stride * sizeof *g->fbar);

@@ -1,4 +1,4 @@
-// What the solver costs, and against what: `make bench`.
+// What the solver costs, and against what: `make bench-solver`.
 //
 // Machines are noisy, so nothing here is measured alone: the things compared take turns, round by
 // round, in one process, and what is printed is the median of the rounds' ratios. Two calibrations
@@ -6,7 +6,7 @@
 // array that no cache holds. They say what the machine could do in the same moments, and the limits
 // in the table are those of its arithmetic or its memory, from the counts of docs/design.md.
 //
-// bench [--quick] [--json FILE] [FILTER]: only groups whose name contains FILTER.
+// bench-solver [--quick] [--json FILE] [FILTER]: only groups whose name contains FILTER.
 #include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -168,7 +168,7 @@ static struct mpm_sim *create(int which, struct block b) {
     if (mpm_create(&w->def, &sim, &err) ||
         (b.fbar_once && (mpm_change(sim, &on, MPM_SET_FBAR, &err) || mpm_step(sim, &err) ||
                          mpm_change(sim, &w->def.settings, MPM_SET_FBAR, &err)))) {
-        fprintf(stderr, "bench: %s %s\n", err.pointer, err.message);
+        fprintf(stderr, "bench-solver: %s %s\n", err.pointer, err.message);
         exit(1);
     }
     return sim;
@@ -181,7 +181,7 @@ static double timed(struct mpm_sim *sim, double seconds) {
     int steps = 0;
     do {
         if (mpm_step(sim, &err)) {
-            fprintf(stderr, "bench: %s\n", err.message);
+            fprintf(stderr, "bench-solver: %s\n", err.message);
             exit(1);
         }
         steps++;
@@ -515,7 +515,7 @@ int main(int argc, char **argv) {
             path = argv[++k];
         } else if (argv[k][0] == '-') {
             fprintf(stderr,
-                    "usage: bench [--quick] [--json FILE] [kernels | ratios | sort | growth]\n");
+                    "usage: bench-solver [--quick] [--json FILE] [kernels | ratios | sort | growth]\n");
             return 2;
         } else {
             filter = argv[k];
