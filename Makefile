@@ -147,6 +147,7 @@ $(B)/tests/%: $(B)/obj/tests/%.o $(SERVER_OBJ) $(call obj,$(PROTO_SRC)) $(B)/lib
 	@mkdir -p $(@D)
 	$(Q)$(CC) $(ALL_LDFLAGS) -pthread $(OPENMP) $^ $(call pc_libs,$(SERVER_LIBS) cmocka) -lm -o $@
 
+$(B)/obj/bench/%.o: ALL_CFLAGS += $(OPENMP) -Wno-missing-prototypes
 $(B)/bench-solver: $(B)/obj/bench/solver.o $(B)/libmpm.a
 	$(call say,LD,$@)
 	$(Q)$(CC) $(ALL_LDFLAGS) $(OPENMP) $^ -lm -o $@

@@ -16,14 +16,15 @@ MPM_KERNEL int mpm_support(const enum mpm_basis basis) {
     return basis == MPM_LINEAR ? 2 : basis == MPM_BSPLINE3 ? 4 : 3;
 }
 
-// The first node that a particle reaches, for MPM_LANES particles at once, as a whole number. Of
-// uGIMP only: `half` is half the particle's size in cells, at most 1/2.
-MPM_KERNEL mpm_vec mpm_base(const enum mpm_basis basis, const mpm_vec xi, const double half) {
+// The first of the nodes whose weights are given, for MPM_LANES particles at once, as a whole
+// number. uGIMP reaches less than 3/2 of a cell to either side, so the node nearest to the particle
+// is always the middle one, as with quadratic B-splines: then particles that lie on a lattice do so
+// well within the reach of their nodes, and not on its edge.
+MPM_KERNEL mpm_vec mpm_base(const enum mpm_basis basis, const mpm_vec xi) {
     switch (basis) {
     case MPM_LINEAR:
         return mpm_trunc(xi);
     case MPM_GIMP:
-        return mpm_trunc(xi - half);
     case MPM_BSPLINE2:
         return mpm_trunc(xi - 0.5);
     default:
@@ -31,7 +32,8 @@ MPM_KERNEL mpm_vec mpm_base(const enum mpm_basis basis, const mpm_vec xi, const 
     }
 }
 
-// The weights from t = xi - base. inv_4_half is 1/(4 half), which the caller divides once.
+// The weights from t = xi - base. Of uGIMP only: `half` is half the particle's size in cells, at
+// most 1/2, and inv_4_half is 1/(4 half), which the caller divides once.
 MPM_KERNEL void mpm_weights_at(const enum mpm_basis basis, const mpm_vec t, const double half,
                                const double inv_4_half, mpm_vec *w, mpm_vec *dw) {
     switch (basis) {
@@ -40,16 +42,18 @@ MPM_KERNEL void mpm_weights_at(const enum mpm_basis basis, const mpm_vec t, cons
         dw[0] = mpm_splat(-1), dw[1] = mpm_splat(1);
         return;
     case MPM_GIMP: {
-        // The hat functions averaged over [xi - half, xi + half]. left and right: how far the two
-        // ends lie from node base + 1, to its left; b: how far the right end lies beyond it.
+        // The hat functions averaged over [t - half, t + half]: how far its two ends lie before the
+        // middle node, and how far beyond it.
         const double r = inv_4_half;
-        const mpm_vec left = (1.0 + half) - t, right = (1.0 - half) - t;
-        const mpm_vec zero = mpm_splat(0), d1 = mpm_max(right, zero), b = mpm_max(-right, zero);
-        w[0] = r * (left * left - d1 * d1);
-        w[2] = r * (b * b);
+        const mpm_vec zero = mpm_splat(0);
+        const mpm_vec left = mpm_max((1.0 + half) - t, zero),
+                      right = mpm_max((1.0 - half) - t, zero);
+        const mpm_vec a = mpm_max(t - (1.0 + half), zero), b = mpm_max(t - (1.0 - half), zero);
+        w[0] = r * (left * left - right * right);
+        w[2] = r * (b * b - a * a);
         w[1] = 1.0 - w[0] - w[2];
-        dw[0] = -2.0 * r * (left - d1);
-        dw[2] = 2.0 * r * b;
+        dw[0] = -2.0 * r * (left - right);
+        dw[2] = 2.0 * r * (b - a);
         dw[1] = -dw[0] - dw[2];
         return;
     }
@@ -74,7 +78,7 @@ MPM_KERNEL void mpm_weights_at(const enum mpm_basis basis, const mpm_vec t, cons
 // Both: returns base.
 MPM_KERNEL mpm_vec mpm_weights(const enum mpm_basis basis, const mpm_vec xi, const double half,
                                const double inv_4_half, mpm_vec *w, mpm_vec *dw) {
-    const mpm_vec base = mpm_base(basis, xi, half);
+    const mpm_vec base = mpm_base(basis, xi);
     mpm_weights_at(basis, xi - base, half, inv_4_half, w, dw);
     return base;
 }

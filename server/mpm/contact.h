@@ -30,8 +30,8 @@ double mpm_shape_distance(const struct mpm_shape *shape, const double *x, int di
 double mpm_barrier_pressure(const struct mpm_rigid_def *def, double d);
 
 // With the particles at x^n: contact and friction forces of one body's particles to the grid, and
-// their sum onto rigid->reaction (which the caller has zeroed). Tiles that are too far from the body
-// for any of their particles are passed by.
+// their sum onto rigid->reaction (which the caller has zeroed). Tiles that are too far from the
+// body for any of their particles are passed by.
 void mpm_contact_forces(struct mpm_rigid *rigid, const struct mpm_kernels *kernels,
                         struct mpm_particles *s, const struct mpm_order *order,
                         struct mpm_grid *grid, double dt);

@@ -8,6 +8,7 @@
 
 #define DIGIT 11 // bits of one pass of the radix sort: its counters fit the first-level cache
 #define N_DIGITS (1 << DIGIT)
+#define TILE_WORK 16 // particles' worth of what a tile costs besides, for sharing work out
 
 static size_t numbers_bytes(size_t n) {
     return (n * sizeof(uint32_t) + 63) / 64 * 64;
@@ -39,6 +40,7 @@ void mpm_sorter_free(struct mpm_sorter *sorter) {
 void mpm_order_free(struct mpm_order *order) {
     free(order->tile);
     free(order->by_colour);
+    free(order->work_before);
     *order = (struct mpm_order){0};
 }
 
@@ -51,10 +53,12 @@ bool mpm_order_reserve(struct mpm_order *order, size_t n) {
     order->tile = tile ? tile : order->tile;
     uint32_t *by_colour = realloc(order->by_colour, capacity * sizeof *by_colour);
     order->by_colour = by_colour ? by_colour : order->by_colour;
-    if (tile && by_colour) {
+    uint64_t *work_before = realloc(order->work_before, (capacity + 1) * sizeof *work_before);
+    order->work_before = work_before ? work_before : order->work_before;
+    if (tile && by_colour && work_before) {
         order->capacity = capacity;
     }
-    return tile && by_colour;
+    return tile && by_colour && work_before;
 }
 
 // The part of n that part k of n_parts takes.
@@ -69,8 +73,7 @@ static void find_keys(const struct mpm_particles *s, const struct mpm_grid *g, e
     for (size_t p = 0; p < s->n; p++) {
         int base[MPM_MAX_DIM];
         for (int d = 0; d < g->dim; d++) {
-            base[d] = (int)mpm_base(basis, (s->x[mpm_at(p, g->dim, d)] - g->origin[d]) * g->inv_h,
-                                    s->half);
+            base[d] = (int)mpm_base(basis, (s->x[mpm_at(p, g->dim, d)] - g->origin[d]) * g->inv_h);
         }
         key[p] = g->dim == 2 ? mpm_cell_key(g, base, 2) : mpm_cell_key(g, base, 3);
     }
@@ -219,6 +222,15 @@ void mpm_order_colour(struct mpm_order *order, const struct mpm_grid *grid, enum
         }
     }
     order->colour_begin[order->n_colours] = n;
+    uint64_t work = 0;
+    for (size_t k = 0; k < n; k++) {
+        const struct mpm_tile *tile = &order->tile[order->by_colour[k]];
+        order->work_before[k] = work;
+        work += tile->end - tile->begin + TILE_WORK;
+    }
+    if (order->work_before) { // else there are no tiles
+        order->work_before[n] = work;
+    }
 }
 
 // The nodes that a particle of a cell can reach while it drifts by less than a cell are
@@ -273,11 +285,10 @@ bool mpm_order_activate(const struct mpm_order *order, struct mpm_grid *grid,
     return true;
 }
 
-bool mpm_activate_around(struct mpm_grid *grid, enum mpm_basis basis, const double *x,
-                         double half) {
+bool mpm_activate_around(struct mpm_grid *grid, enum mpm_basis basis, const double *x) {
     int base[MPM_MAX_DIM];
     for (int d = 0; d < grid->dim; d++) {
-        base[d] = (int)mpm_base(basis, (x[d] - grid->origin[d]) * grid->inv_h, half);
+        base[d] = (int)mpm_base(basis, (x[d] - grid->origin[d]) * grid->inv_h);
     }
     const uint32_t key = grid->dim == 2 ? mpm_cell_key(grid, base, 2) : mpm_cell_key(grid, base, 3);
     const int cell = (int)(key & (uint32_t)(MPM_BLOCK_NODES(grid->dim) - 1));

@@ -21,8 +21,9 @@ struct mpm_tile {
 
 struct mpm_order {
     size_t n_tiles, capacity;
-    struct mpm_tile *tile;                    // by block
-    uint32_t *by_colour;                      // tiles by colour
+    struct mpm_tile *tile; // by block
+    uint32_t *by_colour;   // tiles by colour
+    uint64_t *work_before; // (n_tiles + 1) of by_colour: particles, and what a tile costs besides
     size_t colour_begin[MPM_MAX_COLOURS + 1]; // of by_colour; n_colours + 1 in use
     int n_colours;
 };
@@ -52,4 +53,4 @@ void mpm_order_colour(struct mpm_order *order, const struct mpm_grid *grid, enum
 // memory is short.
 bool mpm_order_activate(const struct mpm_order *order, struct mpm_grid *grid, enum mpm_basis basis);
 // The same for one particle of a body of which only the position is known: to count blocks.
-bool mpm_activate_around(struct mpm_grid *grid, enum mpm_basis basis, const double *x, double half);
+bool mpm_activate_around(struct mpm_grid *grid, enum mpm_basis basis, const double *x);

@@ -481,8 +481,10 @@ enum mpm_status mpm_create(const struct mpm_def *def, struct mpm_sim **out, stru
     for (size_t b = 0; b < sim->n_sets; b++) {
         largest = sim->sets[b].n > largest ? sim->sets[b].n : largest;
     }
-    if (!mpm_sorter_create(&sim->sorter, largest, def->n_threads) || !create_probes(sim) ||
-        !create_body_forces(sim) || !mpm_provide_fbar(sim, widest_fbar(def))) {
+    sim->turns = aligned_alloc(64, (size_t)def->n_threads * sizeof *sim->turns);
+    if (!sim->turns || !mpm_sorter_create(&sim->sorter, largest, def->n_threads) ||
+        !create_probes(sim) || !create_body_forces(sim) ||
+        !mpm_provide_fbar(sim, widest_fbar(def))) {
         goto fail;
     }
     sim->c.base = def->settings;
@@ -516,6 +518,7 @@ void mpm_free(struct mpm_sim *sim) {
         mpm_order_free(&sim->orders[b]);
     }
     mpm_sorter_free(&sim->sorter);
+    free(sim->turns);
     for (size_t k = 0; sim->walls && k < sim->n_walls; k++) {
         mpm_wall_free(&sim->walls[k]);
     }
@@ -550,14 +553,13 @@ void mpm_free(struct mpm_sim *sim) {
 struct counting {
     const struct mpm_def *def;
     struct mpm_grid grid; // of which only the slots are used
-    double half;
     bool out_of_memory;
 };
 
 static bool count_blocks(void *context, const double *x, double volume) {
     struct counting *c = context;
     (void)volume;
-    c->out_of_memory |= !mpm_activate_around(&c->grid, c->def->basis, x, c->half);
+    c->out_of_memory |= !mpm_activate_around(&c->grid, c->def->basis, x);
     return !c->out_of_memory;
 }
 
@@ -573,7 +575,6 @@ void mpm_estimate(const struct mpm_def *def, struct mpm_estimate *out) {
     size_t largest = 0;
     for (size_t b = 0; b < def->n_bodies; b++) {
         const struct mpm_material_def *m = &def->materials[def->bodies[b].material];
-        c.half = mpm_seed_half(&def->bodies[b]);
         const size_t n = mpm_seed(def, &def->bodies[b], count_blocks, &c);
         out->particles += n;
         largest = n > largest ? n : largest;

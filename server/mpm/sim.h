@@ -1,5 +1,7 @@
 // The simulation's inside, shared by the files of the solver.
 #pragma once
+#include <stdatomic.h>
+
 #include "server/mpm/body_force.h"
 #include "server/mpm/boundary.h"
 #include "server/mpm/compare.h"
@@ -41,6 +43,11 @@ struct mpm_clockwork {
     uint64_t runs_at_sort, runs; // particles of one cell in a row: after the sort, and now
 };
 
+// Which tile of a thread's part is next, of this colour and the next one; a cache line for each.
+struct mpm_turn {
+    _Alignas(64) atomic_size_t next[2];
+};
+
 struct mpm_sim {
     const struct mpm_def *def; // borrowed
     enum mpm_isa isa;
@@ -51,6 +58,7 @@ struct mpm_sim {
     struct mpm_particles *sets; // one a body
     struct mpm_order *orders;   // one a body
     struct mpm_sorter sorter;
+    struct mpm_turn *turns; // (n_threads)
     struct mpm_wall *walls;
     struct mpm_load *loads;
     struct mpm_rigid *rigids;

@@ -1,8 +1,12 @@
 // One explicit time step, update stress last: Zhao, Jiang, Choo, section 2.2 and Algorithm 1.
 // The stages below are those of docs/method.md, in its order; equation numbers are the paper's.
+#include <stdatomic.h>
 #include <stdint.h>
 #include <stdio.h>
 #include <string.h>
+#ifdef _OPENMP
+#include <omp.h>
+#endif
 
 #include "server/mpm/sim.h"
 
@@ -66,6 +70,24 @@ static void work_on(const struct mpm_sim *sim, struct mpm_span span, size_t begi
     work(sim, &span, result);
 }
 
+// The first of a colour's tiles that belongs to part k of n: parts hold about as many particles,
+// and lie apart, so that most of the grid that a thread adds to stays with it from colour to
+// colour.
+static size_t part_begin(const struct mpm_order *order, int colour, int k, int n) {
+    size_t lo = order->colour_begin[colour], hi = order->colour_begin[colour + 1];
+    const size_t first = order->work_before[lo], all = order->work_before[hi] - first;
+    const size_t wanted = first + all * (size_t)k / (size_t)n;
+    while (lo < hi) { // the first with at least so much before it
+        const size_t middle = lo + (hi - lo) / 2;
+        if (order->work_before[middle] < wanted) {
+            lo = middle + 1;
+        } else {
+            hi = middle;
+        }
+    }
+    return lo;
+}
+
 // Work that adds to the grid goes tile by tile and colour by colour: tiles of one colour reach no
 // common node, and those of the next wait for them, so that every node's sum has one order whatever
 // the number of threads.
@@ -73,15 +95,34 @@ static void for_tiles(const struct mpm_sim *sim, size_t body, struct mpm_span sp
                       span_work *work) {
     const struct mpm_order *order = &sim->orders[body];
     const int n_threads = sim->def->n_threads;
-    (void)n_threads; // without OpenMP
+    for (int k = 0; k < n_threads; k++) {
+        atomic_store(&sim->turns[k].next[0], part_begin(order, 0, k, n_threads));
+    }
 #pragma omp parallel num_threads(n_threads) if (n_threads > 1)
-    for (int colour = 0; colour < order->n_colours; colour++) {
-#pragma omp for schedule(dynamic, TILES_A_TURN)
-        for (size_t k = order->colour_begin[colour]; k < order->colour_begin[colour + 1]; k++) {
-            const size_t t = order->by_colour[k];
-            const size_t next = k + 1 < order->n_tiles ? order->by_colour[k + 1] : t;
-            work_on(sim, span, order->tile[t].begin, order->tile[t].end, order->tile[next].begin,
-                    work, &sim->results[t]);
+    {
+#ifdef _OPENMP
+        const int own = omp_get_thread_num(), there = omp_get_num_threads();
+#else
+        const int own = 0, there = 1;
+#endif
+        for (int colour = 0; colour < order->n_colours; colour++) {
+            // First one's own part, then what others have not begun.
+            for (int k = 0; k < n_threads; k++) {
+                const int part = (own + k) % n_threads;
+                const size_t end = part_begin(order, colour, part + 1, n_threads);
+                atomic_size_t *turn = &sim->turns[part].next[colour % 2];
+                for (size_t i; (i = atomic_fetch_add(turn, 1)) < end;) {
+                    const size_t t = order->by_colour[i];
+                    const size_t next = i + 1 < order->n_tiles ? order->by_colour[i + 1] : t;
+                    work_on(sim, span, order->tile[t].begin, order->tile[t].end,
+                            order->tile[next].begin, work, &sim->results[t]);
+                }
+            }
+            for (int part = own; colour + 1 < order->n_colours && part < n_threads; part += there) {
+                atomic_store(&sim->turns[part].next[(colour + 1) % 2],
+                             part_begin(order, colour + 1, part, n_threads));
+            }
+#pragma omp barrier
         }
     }
 }
@@ -91,7 +132,7 @@ static size_t for_chunks(const struct mpm_sim *sim, struct mpm_span span, span_w
     const size_t n = span.s->n, n_chunks = (n + MPM_CHUNK - 1) / MPM_CHUNK;
     const int n_threads = sim->def->n_threads;
     (void)n_threads; // without OpenMP
-#pragma omp parallel for schedule(dynamic, 1) num_threads(n_threads) if (n_threads > 1)
+#pragma omp parallel for schedule(static) num_threads(n_threads) if (n_threads > 1)
     for (size_t k = 0; k < n_chunks; k++) {
         const size_t begin = k * MPM_CHUNK, end = begin + MPM_CHUNK;
         work_on(sim, span, begin, end < n ? end : n, end < n ? end : begin, work, &sim->results[k]);

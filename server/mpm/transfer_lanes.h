@@ -142,7 +142,7 @@ MPM_KERNEL void find_cells(struct batch *b, const struct mpm_span *span, const i
             const mpm_vec x = mpm_load_aligned(at(s->x, in, lane, dim, d));
             ahead(s->x, in, lane, dim, d);
             const mpm_vec xi = (x - g->origin[d]) * g->inv_h;
-            const mpm_vec base = mpm_base(basis, xi, s->half);
+            const mpm_vec base = mpm_base(basis, xi);
             const mpm_vec of = mpm_floor(base * (1.0 / MPM_EDGE));
             block = d == 0 ? of : block * (double)g->n_blocks[d] + of;
             const mpm_vec inner = base - of * (double)MPM_EDGE;
