@@ -10,6 +10,7 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <xxhash.h>
 
 // ---- Faults -------------------------------------------------------------------------------------
 
@@ -648,4 +649,8 @@ char *json_print(const cJSON *json, bool indented) {
         text = indented ? cJSON_Print(copy) : cJSON_PrintUnformatted(copy);
     cJSON_Delete(copy);
     return text;
+}
+
+void json_digest(const char *text, char *out) {
+    snprintf(out, JSON_DIGEST, "%016llx", (unsigned long long)XXH3_64bits(text, strlen(text)));
 }

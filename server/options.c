@@ -168,6 +168,10 @@ static void print_help(char *message, size_t n) {
                  table[k].value != NULL ? table[k].value : "");
         used += (size_t)snprintf(message + used, n - used, "  %-26s %s\n", left, table[k].doc);
     }
+    if (used < n)
+        snprintf(message + used, n - used,
+                 "\nFBARD_ISA in the environment: auto, baseline, avx2 or avx512: the solver's "
+                 "instruction set.\n");
 }
 
 static bool assign(struct options *o, enum option option, const char *value) {
@@ -229,7 +233,31 @@ static bool default_data_dir(struct options *o) {
     return n < (int)sizeof o->data_dir;
 }
 
+// FBARD_ISA chooses the solver's kernels, for comparisons and for a processor that throttles.
+static bool isa_from_environment(struct options *o, char *message, size_t n) {
+    const char *text = getenv("FBARD_ISA");
+    int isa = text != NULL && *text != '\0' ? mpm_isa_parse(text) : MPM_ISA_AUTO;
+    if (isa < 0) {
+        size_t used = (size_t)snprintf(message, n, "FBARD_ISA: must be one of");
+        for (int k = 0; k < MPM_N_ISAS && used < n; k++)
+            used +=
+                (size_t)snprintf(message + used, n - used, " %s", mpm_isa_name((enum mpm_isa)k));
+        if (used < n)
+            snprintf(message + used, n - used, ", got '%.60s'", text);
+        return false;
+    }
+    if (!mpm_isa_available((enum mpm_isa)isa)) {
+        snprintf(message, n, "FBARD_ISA: this processor or build has no %s; it has %s", text,
+                 mpm_isa_name(mpm_isa_in_use(MPM_ISA_AUTO)));
+        return false;
+    }
+    o->isa = (enum mpm_isa)isa;
+    return true;
+}
+
 static bool complete(struct options *o, char *message, size_t n) {
+    if (!isa_from_environment(o, message, n))
+        return false;
     if (o->data_dir[0] == '\0' && !default_data_dir(o)) {
         snprintf(message, n, "no --data-dir, and neither XDG_STATE_HOME nor HOME names a folder");
         return false;

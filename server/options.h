@@ -4,6 +4,8 @@
 #include <stddef.h>
 #include <stdint.h>
 
+#include "server/mpm/mpm.h"
+
 enum options_resume { OPTIONS_RESUME_AUTO, OPTIONS_RESUME_PAUSED, OPTIONS_RESUME_OFF };
 
 struct options {
@@ -19,6 +21,7 @@ struct options {
     int slots;                     // runs at a time
     int queue;                     // runs that may wait for a slot
     size_t memory_limit, max_body; // bytes
+    enum mpm_isa isa;              // of the solver's kernels, from FBARD_ISA
 };
 
 enum options_result { OPTIONS_RUN, OPTIONS_PRINTED, OPTIONS_BAD };

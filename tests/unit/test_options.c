@@ -89,6 +89,25 @@ static void test_options_default_folder_follows_xdg(void **state) {
     assert_string_equal(options.data_dir, "/home/me/.local/state/fbard");
 }
 
+static void test_options_isa_comes_from_the_environment(void **state) {
+    (void)state;
+    setenv("FBARD_ISA", "baseline", 1);
+    assert_int_equal(PARSE("--data-dir", "/tmp/x"), OPTIONS_RUN);
+    assert_int_equal(options.isa, MPM_ISA_BASELINE);
+    setenv("FBARD_ISA", "sse9", 1);
+    assert_int_equal(PARSE("--data-dir", "/tmp/x"), OPTIONS_BAD);
+    assert_non_null(strstr(message, "FBARD_ISA: must be one of auto baseline"));
+    assert_non_null(strstr(message, "'sse9'"));
+    for (int k = 0; k < MPM_N_ISAS; k++) {
+        bool there = mpm_isa_available((enum mpm_isa)k);
+        setenv("FBARD_ISA", mpm_isa_name((enum mpm_isa)k), 1);
+        assert_int_equal(PARSE("--data-dir", "/tmp/x"), there ? OPTIONS_RUN : OPTIONS_BAD);
+    }
+    unsetenv("FBARD_ISA");
+    assert_int_equal(PARSE("--data-dir", "/tmp/x"), OPTIONS_RUN);
+    assert_int_equal(options.isa, MPM_ISA_AUTO);
+}
+
 static void test_options_bytes_know_suffixes(void **state) {
     size_t n;
     (void)state;
@@ -139,6 +158,7 @@ int main(int argc, char **argv) {
         cmocka_unit_test(test_options_nonsense_is_refused),
         cmocka_unit_test(test_options_beyond_loopback_needs_a_guard),
         cmocka_unit_test(test_options_default_folder_follows_xdg),
+        cmocka_unit_test(test_options_isa_comes_from_the_environment),
         cmocka_unit_test(test_options_bytes_know_suffixes),
         cmocka_unit_test(test_options_help_names_every_option),
         cmocka_unit_test(test_guard_refuses_foreign_hosts_and_origins),
