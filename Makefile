@@ -4,10 +4,11 @@
 # The one list of what a fresh Debian 12 machine lacks.
 PACKAGES = build-essential pkg-config libmicrohttpd-dev libcjson-dev libzmq3-dev libhdf5-dev \
 	libcurl4-gnutls-dev libxxhash-dev libcmocka-dev gnuplot-nox fonts-dejavu-core curl openssl \
-	python3 python3-numpy python3-h5py python3-pytest python3-zmq python3-jsonschema
+	python3 python3-numpy python3-h5py python3-pytest python3-zmq python3-jsonschema \
+	python3-hypothesis slowhttptest
 # Needed by some targets only: clang builds and the fuzzers; `make check-long`.
 PACKAGES_CLANG = clang-14 libomp-14-dev
-PACKAGES_LONG = $(PACKAGES_CLANG) python3-paraview
+PACKAGES_LONG = $(PACKAGES_CLANG) python3-paraview prometheus
 
 CC ?= gcc
 ifeq ($(origin CC),default)
