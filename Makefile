@@ -33,11 +33,12 @@ CFLAGS.clang = -O2 -g
 CFLAGS.asan = -O2 -g -fsanitize=address,undefined -fno-sanitize-recover=all -fno-omit-frame-pointer
 CFLAGS.tsan = -O1 -g -fsanitize=thread
 CFLAGS.coverage = -O0 -g --coverage
+CFLAGS.fuzz = -O1 -g -fsanitize=fuzzer-no-link,address,undefined -fno-sanitize-recover=all -fno-omit-frame-pointer
 # One meaning of a*b + c for every compiler; no errno, no traps; never -ffast-math.
 FLOAT = -ffp-contract=fast -fno-math-errno -fno-trapping-math
 ALL_CFLAGS = -std=c17 -D_GNU_SOURCE -DFBARD_VERSION='"$(VERSION)"' -I. -MMD -MP $(WARN) $(FLOAT) $(CFLAGS.$(VARIANT)) $(CFLAGS)
 OPENMP ?= -fopenmp
-ifeq ($(VARIANT),tsan)
+ifneq ($(filter tsan fuzz,$(VARIANT)),)
 OPENMP =
 endif
 ALL_LDFLAGS = $(CFLAGS.$(VARIANT)) $(LDFLAGS)
@@ -57,7 +58,8 @@ SCENES = $(sort $(wildcard scenes/*.json))
 obj = $(patsubst %.c,$(B)/obj/%.o,$(1))
 
 # What is compiled once more for each instruction set (server/mpm/simd.h): x.o, x.v3.o, x.v4.o of x.c.
-ifneq ($(filter x86_64%,$(shell $(CC) -dumpmachine)),)
+# Not for the fuzzers, which are after readers: instrumented, these take clang many minutes.
+ifneq ($(filter x86_64%,$(if $(filter fuzz,$(VARIANT)),,$(shell $(CC) -dumpmachine))),)
 LEVELS = v3 v4
 endif
 LANES.v3 = -march=x86-64-v3 -DMPM_LANES=4
@@ -69,7 +71,7 @@ $(B)/obj/server/mpm/kernels.o: ALL_CFLAGS += $(if $(LEVELS),-DMPM_HAS_LANES)
 $(call levels,$(LANES_SRC)): ALL_CFLAGS += -O2 -fno-tree-vectorize -fno-tree-slp-vectorize
 
 .PHONY: all programs deps deps-long libmpm demo check check-all check-layers check-unit check-physics check-api \
-	check-cli check-loss check-asan check-clang check-long bench-recording install uninstall format clean help
+	check-cli check-loss check-asan check-clang check-fuzz check-long fuzz bench-recording install uninstall format clean help
 .DELETE_ON_ERROR:
 .SECONDARY:
 
@@ -139,6 +141,15 @@ $(B)/tests/%: $(B)/obj/tests/%.o $(SERVER_OBJ) $(call obj,$(PROTO_SRC)) $(B)/lib
 	@mkdir -p $(@D)
 	$(Q)$(CC) $(ALL_LDFLAGS) -pthread $(OPENMP) $^ $(call pc_libs,$(SERVER_LIBS) cmocka) -lm -o $@
 
+# Fuzz targets: tests/fuzz/fuzz_*.c, driven by libFuzzer in VARIANT=fuzz, else by replay.c.
+FUZZ = $(patsubst tests/%.c,$(B)/tests/%,$(sort $(wildcard tests/fuzz/fuzz_*.c)))
+FUZZ_DRIVER = $(if $(filter fuzz,$(VARIANT)),,$(B)/obj/tests/fuzz/replay.o)
+$(B)/tests/fuzz/%: $(B)/obj/tests/fuzz/%.o $(B)/obj/tests/fuzz/replay.o $(SERVER_OBJ) $(call obj,client/frameinfo.c $(PROTO_SRC)) $(B)/libmpm.a
+	$(call say,LD,$@)
+	@mkdir -p $(@D)
+	$(Q)$(CC) $(ALL_LDFLAGS) $(if $(FUZZ_DRIVER),,-fsanitize=fuzzer) -pthread $(OPENMP) \
+	  $(filter-out $(if $(FUZZ_DRIVER),,%/replay.o),$^) $(call pc_libs,$(SERVER_LIBS)) -lm -o $@
+
 ## ---- Checks ----
 
 deps: ## install what is missing (Debian packages; as root or with sudo)
@@ -158,7 +169,7 @@ check: deps ## build and run all tests (installs what is missing)
 	@$(MAKE) --no-print-directory check-all
 
 # The test programs, built but not run: in parallel, where the tests themselves run one by one.
-programs: $(UNIT) $(PHYSICS) $(B)/tests/failing.so
+programs: $(UNIT) $(PHYSICS) $(FUZZ) $(B)/tests/failing.so
 
 check-all: all
 	$(Q)$(MAKE) --no-print-directory check-layers check-unit check-physics check-api check-cli check-loss
@@ -193,8 +204,25 @@ check-loss: all $(B)/tests/failing.so ## kills, failing disks, recorders that st
 # The same unit and API tests under AddressSanitizer and UBSan.
 check-asan:
 	$(Q)$(MAKE) --no-print-directory -j$$(nproc) VARIANT=asan build/asan/fbard build/asan/fbar programs
-	$(Q)$(MAKE) --no-print-directory VARIANT=asan check-unit
+	$(Q)$(MAKE) --no-print-directory VARIANT=asan check-unit check-fuzz
 	$(Q)FBARD=$(CURDIR)/build/asan/fbard FBAR=$(CURDIR)/build/asan/fbar $(PYTEST) tests/api
+
+check-fuzz: $(FUZZ) ## the fuzzers' corpus once more, without fuzzing
+	$(Q)set -e; for t in $^; do $$t tests/fuzz/corpus/$${t##*fuzz_}/*; done
+
+# New inputs go to build/fuzz/corpus; what crashes, hangs or leaks stays in build/fuzz as crash-*, to be added to
+# tests/fuzz/corpus with the fix.
+FUZZ_SECONDS ?= 600
+fuzz: ## libFuzzer with clang 14, FUZZ_SECONDS (600) for each target
+	$(Q)$(MAKE) --no-print-directory CC=clang-14 VARIANT=fuzz programs-fuzz
+	$(Q)set -e; for t in $(notdir $(FUZZ)); do n=$${t#fuzz_}; mkdir -p build/fuzz/corpus/$$n; \
+	  echo "== $$t"; build/fuzz/tests/fuzz/$$t -max_total_time=$(FUZZ_SECONDS) -timeout=20 -rss_limit_mb=4096 -max_len=20000 \
+	  -print_final_stats=1 -artifact_prefix=build/fuzz/crash-$$n- build/fuzz/corpus/$$n tests/fuzz/corpus/$$n 2>build/fuzz/$$n.log || \
+	  { tail -60 build/fuzz/$$n.log; exit 1; }; \
+	  grep -E 'stat::(number_of_executed|new_units)|^Done' build/fuzz/$$n.log; done
+
+.PHONY: programs-fuzz
+programs-fuzz: $(FUZZ)
 
 check-clang: ## warnings and unit tests with clang 14
 	$(Q)$(MAKE) --no-print-directory CC=clang-14 VARIANT=clang OPENMP=-fopenmp=libomp CFLAGS=-Werror \
