@@ -58,7 +58,7 @@ SCENES = $(sort $(wildcard scenes/*.json))
 obj = $(patsubst %.c,$(B)/obj/%.o,$(1))
 
 # What is compiled once more for each instruction set (server/mpm/simd.h): x.o, x.v3.o, x.v4.o of x.c.
-# Not for the fuzzers, which are after readers: instrumented, these take clang many minutes.
+# Not for the fuzzers, which are after readers: instrumented, kernels take clang many minutes.
 ifneq ($(filter x86_64%,$(if $(filter fuzz,$(VARIANT)),,$(shell $(CC) -dumpmachine))),)
 LEVELS = v3 v4
 endif
@@ -90,6 +90,7 @@ $(B)/libmpm.a: $(call obj,$(MPM_SRC)) $(call levels,$(LANES_SRC))
 	$(Q)rm -f $@ && $(AR) rcs $@ $^
 
 $(B)/obj/server/mpm/%.o: ALL_CFLAGS += $(OPENMP)
+$(B)/obj/server/mpm/transfer.o: CFLAGS.fuzz = -O1 -g
 SERVER_LIBS = libmicrohttpd libcjson libzmq libxxhash
 CLIENT_LIBS = libcurl libcjson libzmq libxxhash $(HDF5_PC)
 $(call obj,$(SERVER_SRC)): ALL_CFLAGS += $(call pc_cflags,$(SERVER_LIBS)) -pthread

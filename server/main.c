@@ -57,7 +57,8 @@ static int run_daemon(const struct options *options, const sigset_t *signals) {
         goto done;
     host.slots = slots_create(options->slots, options->memory_limit);
     host.publisher =
-        publish_start(options->publish, routes.publish_url, sizeof routes.publish_url, why);
+        publish_start(options->publish, options->curve_dir[0] != '\0' ? options->curve_dir : NULL,
+                      routes.publish_url, sizeof routes.publish_url, routes.publish_key, why);
     routes.host = &host;
     routes.runs = runs_create(&host, options->slots, options->queue);
     if (host.slots == NULL || host.publisher == NULL || routes.runs == NULL)

@@ -136,7 +136,7 @@ static bool parse_resume(const char *text, enum options_resume *out) {
     X(TOKEN_FILE, "--token-file", "FILE", "every request must carry this bearer token")            \
     X(TLS_CERT, "--tls-cert", "FILE", "serve HTTPS with this certificate (PEM)")                   \
     X(TLS_KEY, "--tls-key", "FILE", "its key (PEM)")                                               \
-    X(CURVE_DIR, "--curve-dir", "DIR", "encrypted ZeroMQ: not in this version")                    \
+    X(CURVE_DIR, "--curve-dir", "DIR", "encrypt ZeroMQ with the keys of fbar keygen DIR")          \
     X(PORT_FILE, "--port-file", "FILE", "receives {\"http\": ..., \"publish\": ...} when ready")   \
     X(MEMORY_LIMIT, "--memory-limit", "BYTES", "of all simulations; suffix K, M, G (80 % of RAM)") \
     X(MAX_BODY, "--max-body", "BYTES", "largest request body (8M)")                                \
@@ -196,6 +196,8 @@ static bool assign(struct options *o, enum option option, const char *value) {
         return *value != '\0' && copy(o->tls_cert, sizeof o->tls_cert, value);
     case OPTION_TLS_KEY:
         return *value != '\0' && copy(o->tls_key, sizeof o->tls_key, value);
+    case OPTION_CURVE_DIR:
+        return *value != '\0' && copy(o->curve_dir, sizeof o->curve_dir, value);
     case OPTION_PORT_FILE:
         return *value != '\0' && copy(o->port_file, sizeof o->port_file, value);
     case OPTION_MEMORY_LIMIT:
@@ -205,7 +207,6 @@ static bool assign(struct options *o, enum option option, const char *value) {
     case OPTION_INSECURE:
         o->insecure = true;
         return true;
-    case OPTION_CURVE_DIR:
     case OPTION_HELP:
     case OPTION_VERSION:
     case N_OPTIONS:
@@ -274,11 +275,12 @@ static bool complete(struct options *o, char *message, size_t n) {
                  o->http_host);
         return false;
     }
-    if (!o->publish_loopback && !o->insecure) {
-        snprintf(message, n,
-                 "--publish %s is beyond loopback, and this version has no CURVE: give --insecure "
-                 "to publish in the clear",
-                 o->publish);
+    if (!o->publish_loopback && o->curve_dir[0] == '\0' && !o->insecure) {
+        snprintf(
+            message, n,
+            "--publish %s is beyond loopback: give --curve-dir (fbar keygen), or --insecure to "
+            "publish in the clear",
+            o->publish);
         return false;
     }
     if (o->threads == 0)
@@ -316,10 +318,6 @@ enum options_result options_parse(int argc, char *const *argv, struct options *o
         if (option == OPTION_VERSION) {
             snprintf(message, message_bytes, "fbard %s\n", FBARD_VERSION);
             return OPTIONS_PRINTED;
-        }
-        if (option == OPTION_CURVE_DIR) {
-            snprintf(message, message_bytes, "--curve-dir: this version has no CURVE encryption");
-            return OPTIONS_BAD;
         }
         const char *value = equals != NULL ? equals + 1 : NULL;
         if (table[option].value == NULL && value != NULL) {

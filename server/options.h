@@ -14,7 +14,7 @@ struct options {
     char publish[300]; // a ZeroMQ endpoint
     bool publish_loopback;
     char data_dir[4096 - 256]; // room for the files inside within PATH_MAX
-    char token_file[4096], tls_cert[4096], tls_key[4096], port_file[4096];
+    char token_file[4096], tls_cert[4096], tls_key[4096], port_file[4096], curve_dir[4000];
     enum options_resume resume;
     bool insecure;
     int threads;                   // solver threads of one run

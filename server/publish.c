@@ -16,6 +16,7 @@
 
 #include "proto/frame.h"
 #include "server/log.h"
+#include "server/zap.h"
 
 #define SEND_HIGH_WATER 8 // messages a subscriber may lag before it loses some
 #define LINGER_MS 1000
@@ -57,6 +58,7 @@ struct topic {
 
 struct publisher {
     void *context, *socket;
+    struct zap *zap; // NULL: not encrypted
     pthread_t thread;
     pthread_mutex_t lock;
     pthread_cond_t work, done; // both on CLOCK_MONOTONIC
@@ -350,8 +352,33 @@ static void condition_init(pthread_cond_t *condition) {
     pthread_condattr_destroy(&attributes);
 }
 
-struct publisher *publish_start(const char *address, char *endpoint, size_t endpoint_bytes,
-                                char *why) {
+// In draft interfaces of libzmq only. Without it, a socket whose ZAP handler is gone would admit
+// anybody; ours is there as long as the socket.
+#ifndef ZMQ_ZAP_ENFORCE_DOMAIN
+#define ZMQ_ZAP_ENFORCE_DOMAIN 93
+#endif
+
+// Encrypts the socket and has zap.c asked who may subscribe.
+static bool encrypt(struct publisher *p, const char *folder, char *key, char *why) {
+    char secret[ZAP_KEY];
+    int one = 1;
+    p->zap = zap_start(p->context, folder, key, secret, why);
+    if (p->zap == NULL)
+        return false;
+    bool set = zmq_setsockopt(p->socket, ZMQ_CURVE_SERVER, &one, sizeof one) == 0 &&
+               zmq_setsockopt(p->socket, ZMQ_CURVE_SECRETKEY, secret, sizeof secret) == 0 &&
+               zmq_setsockopt(p->socket, ZMQ_ZAP_DOMAIN, ZAP_DOMAIN, strlen(ZAP_DOMAIN)) == 0;
+    explicit_bzero(secret, sizeof secret);
+    if (!set)
+        snprintf(why, JOURNAL_WHY, "--curve-dir: %s", zmq_strerror(errno));
+    else if (zmq_setsockopt(p->socket, ZMQ_ZAP_ENFORCE_DOMAIN, &one, sizeof one) != 0)
+        log_line(LOG_LEVEL_DEBUG, "zap", "enforced_by=handler");
+    return set;
+}
+
+struct publisher *publish_start(const char *address, const char *curve_dir, char *endpoint,
+                                size_t endpoint_bytes, char *key, char *why) {
+    key[0] = '\0';
     struct publisher *p = calloc(1, sizeof *p);
     if (p == NULL) {
         snprintf(why, JOURNAL_WHY, "out of memory");
@@ -364,6 +391,8 @@ struct publisher *publish_start(const char *address, char *endpoint, size_t endp
         v6 = strchr(address, '[') != NULL;
     p->context = zmq_ctx_new();
     p->socket = p->context != NULL ? zmq_socket(p->context, ZMQ_XPUB) : NULL;
+    if (p->socket != NULL && curve_dir != NULL && !encrypt(p, curve_dir, key, why))
+        goto fail;
     if (p->socket == NULL || zmq_setsockopt(p->socket, ZMQ_LINGER, &linger, sizeof linger) != 0 ||
         zmq_setsockopt(p->socket, ZMQ_SNDHWM, &high_water, sizeof high_water) != 0 ||
         zmq_setsockopt(p->socket, ZMQ_IPV6, &v6, sizeof v6) != 0 ||
@@ -384,6 +413,7 @@ fail:
         zmq_close(p->socket);
     if (p->context != NULL)
         zmq_ctx_term(p->context);
+    zap_join(p->zap);
     free(p);
     return NULL;
 }
@@ -397,6 +427,7 @@ void publish_stop(struct publisher *p) {
     pthread_mutex_unlock(&p->lock);
     pthread_join(p->thread, NULL);
     zmq_ctx_term(p->context); // waits LINGER_MS at most for subscribers
+    zap_join(p->zap);
     pthread_cond_destroy(&p->work);
     pthread_cond_destroy(&p->done);
     pthread_mutex_destroy(&p->lock);

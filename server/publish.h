@@ -26,10 +26,13 @@ struct outlet_frame {
     unsigned char *frame; // info.bytes bytes, 64-byte aligned
 };
 
-// Binds the socket and starts the thread. `endpoint` receives the address with the port that was
-// picked. NULL with a sentence in `why` (JOURNAL_WHY bytes).
-struct publisher *publish_start(const char *address, char *endpoint, size_t endpoint_bytes,
-                                char *why);
+#define PUBLISH_KEY 41 // bytes of a public key
+
+// Binds the socket and starts the thread; with a folder of keys (server/zap.h), encrypted.
+// `endpoint` receives the address with the port that was picked, `key` (PUBLISH_KEY bytes) the
+// public key or "". NULL with a sentence in `why` (JOURNAL_WHY bytes).
+struct publisher *publish_start(const char *address, const char *curve_dir, char *endpoint,
+                                size_t endpoint_bytes, char *key, char *why);
 void publish_count(struct publisher *publisher, struct publish_counts *out);
 // Writes and publishes what is queued, waits about a second for subscribers to take it, and ends.
 void publish_stop(struct publisher *publisher);

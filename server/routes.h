@@ -17,6 +17,7 @@ struct routes {
     struct runs *runs;
     struct guard guard;
     char http_url[320], publish_url[320];
+    char publish_key[PUBLISH_KEY]; // of the encrypted ZeroMQ socket, or ""
     struct http_server *http;
     atomic_int streams;                        // open
     atomic_ullong stream_sent, stream_skipped; // frames

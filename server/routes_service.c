@@ -48,6 +48,8 @@ void routes_serve_service(struct call *c) {
     endpoints = cJSON_AddObjectToObject(json, "endpoints");
     cJSON_AddStringToObject(endpoints, "http", c->routes->http_url);
     cJSON_AddStringToObject(endpoints, "publish", c->routes->publish_url);
+    if (c->routes->publish_key[0] != '\0')
+        cJSON_AddStringToObject(endpoints, "publish_key", c->routes->publish_key);
     reply_json(c->reply, 200, json);
 }
 

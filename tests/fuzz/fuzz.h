@@ -1,5 +1,5 @@
-// What the fuzz targets share. A target is LLVMFuzzerTestOneInput of one file; libFuzzer drives it in
-// `make fuzz`, replay.c over the corpus in `make check`.
+// What the fuzz targets share. A target is LLVMFuzzerTestOneInput of one file; libFuzzer drives it
+// in `make fuzz`, replay.c over the corpus in `make check`.
 #pragma once
 #include <stddef.h>
 #include <stdint.h>

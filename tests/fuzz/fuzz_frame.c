@@ -48,7 +48,8 @@ static void read_all(const unsigned char *frame, size_t size) {
 }
 
 int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size) {
-    unsigned char *frame = aligned_alloc(FRAME_ALIGN, (size + FRAME_ALIGN) / FRAME_ALIGN * FRAME_ALIGN);
+    unsigned char *frame =
+        aligned_alloc(FRAME_ALIGN, (size + FRAME_ALIGN) / FRAME_ALIGN * FRAME_ALIGN);
     unsigned char *exact = malloc(size > 0 ? size : 1);
     memcpy(frame, data, size);
     memcpy(exact, data, size);

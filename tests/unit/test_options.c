@@ -55,7 +55,7 @@ static void test_options_nonsense_is_refused(void **state) {
         {"--http", "::1:80"},     {"--http", ":80"},       {"--publish", "udp://127.0.0.1:1"},
         {"--publish", "tcp://x"}, {"--slots", "0"},        {"--slots", "2x"},
         {"--threads", "-1"},      {"--resume", "perhaps"}, {"--memory-limit", "much"},
-        {"--max-body", "0"},      {"--data-dir", ""},      {"--curve-dir", "/tmp"},
+        {"--max-body", "0"},      {"--data-dir", ""},      {"--curve-dir", ""},
         {"--tls-cert", "/tmp/c"}, {"--insecure=1", "x"},   {"--port-file", ""},
     };
     for (size_t k = 0; k < sizeof bad / sizeof *bad; k++) {
@@ -76,6 +76,9 @@ static void test_options_beyond_loopback_needs_a_guard(void **state) {
     assert_int_equal(PARSE("--data-dir", "/tmp/x", "--http", "0.0.0.0:0", "--insecure"),
                      OPTIONS_RUN);
     assert_int_equal(PARSE("--data-dir", "/tmp/x", "--publish", "tcp://0.0.0.0:0"), OPTIONS_BAD);
+    assert_int_equal(
+        PARSE("--data-dir", "/tmp/x", "--publish", "tcp://0.0.0.0:0", "--curve-dir", "/k"),
+        OPTIONS_RUN);
 }
 
 static void test_options_default_folder_follows_xdg(void **state) {
