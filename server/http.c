@@ -22,9 +22,12 @@
 
 #include "server/log.h"
 
-#define CONNECTIONS_MAX (HTTP_CONNECTIONS + 16) // room to refuse in, and for those being closed
-#define SLOW_SECONDS 10 // a reply that takes so long to be read may be given up for others
-#define PEER_SECONDS 30 // what was sent and is not acknowledged for so long ends the connection
+// What libmicrohttpd holds at most: those that are being closed have threads for a while yet, and
+// it drops newcomers at its own limit without an answer.
+#define CONNECTIONS_MAX (HTTP_CONNECTIONS + 784)
+#define SLOW_SECONDS 10  // a reply that takes so long to be read may be given up for others
+#define STOP_SECONDS 2.0 // for what is being answered when the daemon ends
+#define PEER_SECONDS 30  // what was sent and is not acknowledged for so long ends the connection
 #define IDLE_SECONDS 30
 #define BACKLOG 128
 #define DRAIN_MAX ((uint64_t)1 << 30) // bytes of an unwanted body that are read before giving up
@@ -573,9 +576,25 @@ void http_quiesce(struct http_server *server) {
         close(listener);
 }
 
+// libmicrohttpd cuts connections where they stand; what is being answered gets a moment to be read.
+static void wait_for_replies(struct http_server *server) {
+    double until = seconds_now() + STOP_SECONDS;
+    bool busy = true;
+    while (busy && seconds_now() < until) {
+        busy = false;
+        pthread_mutex_lock(&server->lock);
+        for (const struct peer *p = server->peers; p != NULL && !busy; p = p->next)
+            busy = p->stage != PEER_QUIET && !p->evicted;
+        pthread_mutex_unlock(&server->lock);
+        if (busy)
+            nanosleep(&(struct timespec){.tv_nsec = 10000000}, NULL);
+    }
+}
+
 void http_stop(struct http_server *server) {
     if (server == NULL)
         return;
+    wait_for_replies(server);
     MHD_stop_daemon(server->daemon);
     pthread_mutex_destroy(&server->lock);
     free(server->cert);

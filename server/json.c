@@ -336,10 +336,10 @@ static int compare_open_keys(const void *a, const void *b) {
 // Sorted rather than hashed, so that no choice of keys makes it quadratic. The first repetition in
 // the text is the one reported.
 static bool keys_differ(struct reader *r, size_t base) {
-    struct open_key *keys = r->keys + base;
     size_t n = r->n_keys - base, first = SIZE_MAX;
     if (n < 2)
         return true;
+    struct open_key *keys = r->keys + base;
     qsort(keys, n, sizeof *keys, compare_open_keys);
     for (size_t i = 1; i < n; i++)
         if (strcmp(keys[i - 1].key, keys[i].key) == 0 && keys[i].offset < first)
