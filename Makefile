@@ -71,7 +71,7 @@ $(B)/obj/server/mpm/kernels.o: ALL_CFLAGS += $(if $(LEVELS),-DMPM_HAS_LANES)
 $(call levels,$(LANES_SRC)): ALL_CFLAGS += -O2 -fno-tree-vectorize -fno-tree-slp-vectorize
 
 .PHONY: all programs deps deps-long libmpm demo check check-all check-layers check-unit check-physics check-api \
-	check-cli check-loss check-asan check-clang check-fuzz check-long fuzz bench-recording install uninstall format clean help
+	check-cli check-loss check-asan check-clang check-fuzz check-tsan check-long fuzz bench-recording bench-status install uninstall format clean help
 .DELETE_ON_ERROR:
 .SECONDARY:
 
@@ -208,6 +208,12 @@ check-asan:
 	$(Q)$(MAKE) --no-print-directory VARIANT=asan check-unit check-fuzz
 	$(Q)FBARD=$(CURDIR)/build/asan/fbard FBAR=$(CURDIR)/build/asan/fbar $(PYTEST) tests/api
 
+# One solver thread: GCC's OpenMP is not instrumented. tests/api/tsan.supp has the libraries that are not either.
+check-tsan: ## many clients, subscribers and patches under ThreadSanitizer
+	$(Q)$(MAKE) --no-print-directory -j$$(nproc) VARIANT=tsan build/tsan/fbard
+	$(Q)FBARD=$(CURDIR)/build/tsan/fbard FBAR=$(CURDIR)/$(B)/fbar $(PYTEST) tests/api/test_threads.py tests/api/test_concurrency.py \
+	  tests/api/test_watching.py tests/api/test_connections.py tests/api/test_model.py
+
 check-fuzz: $(FUZZ) ## the fuzzers' corpus once more, without fuzzing
 	$(Q)set -e; for t in $^; do $$t tests/fuzz/corpus/$${t##*fuzz_}/*; done
 
@@ -230,10 +236,13 @@ check-clang: ## warnings and unit tests with clang 14
 	  build/clang/fbard build/clang/fbar check-unit
 
 check-long: deps-long ## the longer verification: minutes to hours
-	@FBARD_LONG=1 $(MAKE) --no-print-directory check-all check-clang
+	@FBARD_LONG=1 $(MAKE) --no-print-directory check-all check-clang check-tsan
 
 bench-recording: all ## what journal and recording cost a run, and how fast fbar records
 	$(Q)FBARD=$(CURDIR)/$(B)/fbard FBAR=$(CURDIR)/$(B)/fbar $(PYTHON) bench/recording.py
+
+bench-status: all ## how fast the daemon answers while a run uses all cores, and what that costs the run
+	$(Q)FBARD=$(CURDIR)/$(B)/fbard $(PYTHON) bench/status.py
 
 ## ---- Use ----
 

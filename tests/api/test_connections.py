@@ -6,7 +6,7 @@ import subprocess
 import time
 
 import pytest
-from boxes import endless, water
+from boxes import big, endless, merged, water
 from fbard import is_sanitized, until
 from test_watching import Stream, metrics
 
@@ -98,10 +98,46 @@ def test_daemon_takes_as_many_streams_as_it_says(daemon, name):
     daemon.away(name)
 
 
+def test_newcomer_is_told_when_everybody_is_busy(daemon, name):
+    """All places of this address are taken by those who are being answered."""
+    limits = daemon.get("/v1")["limits"]
+    fields = ["position", "velocity", "displacement", "stress", "mean_stress", "von_mises", "volume_ratio"]
+    daemon.create(merged(big(256), {"output": {"fields": fields}}), id=name, start=False)
+    until(lambda: daemon.frames(name))
+    assert daemon.frames(name)[0]["bytes"] > 10e6, "more than sockets hold"
+    host, port = daemon.host.split(":")
+    streams, readers = [], []
+    try:
+        for _ in range(limits["streams"]):
+            streams.append(Stream(daemon, f"/v1/runs/{name}/events"))
+        for _ in range(limits["connections_of_address"] - limits["streams"]):
+            s = socket.socket()
+            s.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+            s.settimeout(10)
+            s.connect((host, int(port)))
+            s.sendall(f"GET /v1/runs/{name}/frames/0 HTTP/1.1\r\nHost: {daemon.host}\r\n\r\n".encode())
+            assert s.recv(12) == b"HTTP/1.1 200"
+            readers.append(s)
+        reply = daemon.ask("GET", "/healthz", status=503)
+        assert reply.headers["connection"] == "close" and "192" in reply.json["detail"]
+        assert reply.headers["retry-after"]
+    finally:
+        for stream in streams:
+            stream.connection.close()
+            stream.answer.close()
+        for s in readers:
+            s.close()
+    until(lambda: daemon.request("GET", "/healthz").status == 200)
+    assert metrics(daemon)["fbard_http_connections_refused_total", ""] >= 1
+    daemon.away(name)
+
+
 @pytest.mark.parametrize("how", [["-H"], ["-B"], ["-X"]], ids=["slow headers", "slow bodies", "slow reading"])
 def test_slowhttptest_leaves_the_api_answering(daemon, how):
     if shutil.which("slowhttptest") is None:
         pytest.skip("no slowhttptest")
+    if is_sanitized():
+        pytest.skip("a matter of time, not of memory; the idle connections above are for that")
     attack = subprocess.Popen(
         ["slowhttptest", *how, "-c", "600", "-r", "200", "-i", "1", "-l", "3", "-x", "24", "-p", "1",
          "-u", daemon.http + ("/openapi.json" if how == ["-X"] else "/v1/runs")],
