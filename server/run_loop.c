@@ -319,6 +319,11 @@ static void finish(struct run *r) {
         return;
     if (!r->end_pushed)
         r->end_pushed = end_push(r);
+    // The frames on their way may fail after the last one was pushed behind them.
+    enum journal_result status = publish_status(r->outlet, why);
+    if (r->end_pushed && r->ending == RUN_COMPLETED &&
+        (status == JOURNAL_ERROR || (status == JOURNAL_FULL && !r->config.output.when_full_block)))
+        run_fail(r, "journal", "look at the disk of the data folder", why);
     bool forced = r->ending != RUN_COMPLETED && !journal_works(r);
     if (!r->end_pushed || (!publish_flush(r->outlet, 0) && !forced))
         return;
