@@ -4,10 +4,11 @@
 # The one list of what a fresh Debian 12 machine lacks.
 PACKAGES = build-essential pkg-config libmicrohttpd-dev libcjson-dev libzmq3-dev libhdf5-dev \
 	libcurl4-gnutls-dev libxxhash-dev libcmocka-dev gnuplot-nox fonts-dejavu-core curl openssl \
-	python3 python3-numpy python3-h5py python3-pytest python3-zmq python3-jsonschema
+	python3 python3-numpy python3-h5py python3-pytest python3-zmq python3-jsonschema \
+	python3-hypothesis slowhttptest
 # Needed by some targets only: clang builds and the fuzzers; `make check-long`.
 PACKAGES_CLANG = clang-14 libomp-14-dev
-PACKAGES_LONG = $(PACKAGES_CLANG) python3-paraview
+PACKAGES_LONG = $(PACKAGES_CLANG) python3-paraview prometheus
 
 CC ?= gcc
 ifeq ($(origin CC),default)
@@ -32,11 +33,12 @@ CFLAGS.clang = -O2 -g
 CFLAGS.asan = -O2 -g -fsanitize=address,undefined -fno-sanitize-recover=all -fno-omit-frame-pointer
 CFLAGS.tsan = -O1 -g -fsanitize=thread
 CFLAGS.coverage = -O0 -g --coverage
+CFLAGS.fuzz = -O1 -g -fsanitize=fuzzer-no-link,address,undefined -fno-sanitize-recover=all -fno-omit-frame-pointer
 # One meaning of a*b + c for every compiler; no errno, no traps; never -ffast-math.
 FLOAT = -ffp-contract=fast -fno-math-errno -fno-trapping-math
 ALL_CFLAGS = -std=c17 -D_GNU_SOURCE -DFBARD_VERSION='"$(VERSION)"' -I. -MMD -MP $(WARN) $(FLOAT) $(CFLAGS.$(VARIANT)) $(CFLAGS)
 OPENMP ?= -fopenmp
-ifeq ($(VARIANT),tsan)
+ifneq ($(filter tsan fuzz,$(VARIANT)),)
 OPENMP =
 endif
 ALL_LDFLAGS = $(CFLAGS.$(VARIANT)) $(LDFLAGS)
@@ -57,7 +59,8 @@ TABLES = $(sort $(wildcard scenes/reference/*.csv))
 obj = $(patsubst %.c,$(B)/obj/%.o,$(1))
 
 # What is compiled once more for each instruction set (server/mpm/simd.h): x.o, x.v3.o, x.v4.o of x.c.
-ifneq ($(filter x86_64%,$(shell $(CC) -dumpmachine)),)
+# Not for the fuzzers, which are after readers: instrumented, kernels take clang many minutes.
+ifneq ($(filter x86_64%,$(if $(filter fuzz,$(VARIANT)),,$(shell $(CC) -dumpmachine))),)
 LEVELS = v3 v4
 endif
 LANES.v3 = -march=x86-64-v3 -DMPM_LANES=4
@@ -70,7 +73,8 @@ $(call levels,$(LANES_SRC)): ALL_CFLAGS += $(if $(filter asan tsan debug coverag
 	-fno-tree-vectorize -fno-tree-slp-vectorize
 
 .PHONY: all programs deps deps-long libmpm demo check check-all check-layers check-unit check-physics check-api \
-	check-cli check-loss check-asan check-clang unit-programs check-long bench bench-solver bench-peer bench-recording install uninstall format clean help
+	check-cli check-loss check-asan check-clang check-fuzz check-tsan unit-programs check-long bench bench-solver bench-peer \
+	bench-recording bench-status fuzz install uninstall format clean help
 .DELETE_ON_ERROR:
 .SECONDARY:
 
@@ -89,6 +93,7 @@ $(B)/libmpm.a: $(call obj,$(MPM_SRC)) $(call levels,$(LANES_SRC))
 	$(Q)rm -f $@ && $(AR) rcs $@ $^
 
 $(B)/obj/server/mpm/%.o: ALL_CFLAGS += $(OPENMP)
+$(B)/obj/server/mpm/transfer.o: CFLAGS.fuzz = -O1 -g
 SERVER_LIBS = libmicrohttpd libcjson libzmq libxxhash
 CLIENT_LIBS = libcurl libcjson libzmq libxxhash $(HDF5_PC)
 $(call obj,$(SERVER_SRC)): ALL_CFLAGS += $(call pc_cflags,$(SERVER_LIBS)) -pthread
@@ -152,6 +157,15 @@ $(B)/bench-solver: $(B)/obj/bench/solver.o $(B)/libmpm.a
 	$(call say,LD,$@)
 	$(Q)$(CC) $(ALL_LDFLAGS) $(OPENMP) $^ -lm -o $@
 
+# Fuzz targets: tests/fuzz/fuzz_*.c, driven by libFuzzer in VARIANT=fuzz, else by replay.c.
+FUZZ = $(patsubst tests/%.c,$(B)/tests/%,$(sort $(wildcard tests/fuzz/fuzz_*.c)))
+FUZZ_DRIVER = $(if $(filter fuzz,$(VARIANT)),,$(B)/obj/tests/fuzz/replay.o)
+$(B)/tests/fuzz/%: $(B)/obj/tests/fuzz/%.o $(B)/obj/tests/fuzz/replay.o $(SERVER_OBJ) $(call obj,client/frameinfo.c $(PROTO_SRC)) $(B)/libmpm.a
+	$(call say,LD,$@)
+	@mkdir -p $(@D)
+	$(Q)$(CC) $(ALL_LDFLAGS) $(if $(FUZZ_DRIVER),,-fsanitize=fuzzer) -pthread $(OPENMP) \
+	  $(filter-out $(if $(FUZZ_DRIVER),,%/replay.o),$^) $(call pc_libs,$(SERVER_LIBS)) -lm -o $@
+
 ## ---- Checks ----
 
 deps: ## install what is missing (Debian packages; as root or with sudo)
@@ -171,7 +185,7 @@ check: deps ## build and run all tests (installs what is missing)
 	@$(MAKE) --no-print-directory check-all
 
 # The test programs, built but not run: in parallel, where the tests themselves run one by one.
-programs: $(UNIT) $(PHYSICS) $(B)/tests/failing.so
+programs: $(UNIT) $(PHYSICS) $(FUZZ) $(B)/tests/failing.so
 
 check-all: all
 	$(Q)$(MAKE) --no-print-directory check-layers check-unit check-physics check-api check-cli check-loss
@@ -213,16 +227,40 @@ ASAN_API = $(if $(FBARD_LONG),tests/api,$(wildcard tests/api/test_requests_*.py 
 check-asan: ## unit and API tests with sanitizers
 	$(Q)$(MAKE) --no-print-directory -j$$(nproc) VARIANT=asan LEFT_OUT="$(ASAN_SLOW)" \
 	  build/asan/fbard build/asan/fbar unit-programs
-	$(Q)$(MAKE) --no-print-directory VARIANT=asan LEFT_OUT="$(ASAN_SLOW)" check-unit
+	$(Q)$(MAKE) --no-print-directory VARIANT=asan LEFT_OUT="$(ASAN_SLOW)" check-unit check-fuzz
 	$(Q)FBARD=$(CURDIR)/build/asan/fbard FBAR=$(CURDIR)/build/asan/fbar $(PYTEST) $(ASAN_API)
+
+# One solver thread: GCC's OpenMP is not instrumented. tests/api/tsan.supp has the libraries that are not either.
+check-tsan: ## many clients, subscribers and patches under ThreadSanitizer
+	$(Q)$(MAKE) --no-print-directory -j$$(nproc) VARIANT=tsan build/tsan/fbard
+	$(Q)FBARD=$(CURDIR)/build/tsan/fbard FBAR=$(CURDIR)/$(B)/fbar $(PYTEST) tests/api/test_threads.py tests/api/test_concurrency.py \
+	  tests/api/test_watching.py tests/api/test_connections.py tests/api/test_model.py
+
+check-fuzz: $(FUZZ) ## the fuzzers' corpus once more, without fuzzing
+	$(Q)set -e; for t in $^; do $$t tests/fuzz/corpus/$${t##*fuzz_}/*; done
+
+# New inputs go to build/fuzz/corpus; what crashes, hangs or leaks stays in build/fuzz as crash-*, to be added to
+# tests/fuzz/corpus with the fix.
+FUZZ_SECONDS ?= 600
+fuzz: ## libFuzzer with clang 14, FUZZ_SECONDS (600) for each target
+	$(Q)$(MAKE) --no-print-directory CC=clang-14 VARIANT=fuzz programs-fuzz
+	$(Q)set -e; for t in $(notdir $(FUZZ)); do n=$${t#fuzz_}; mkdir -p build/fuzz/corpus/$$n; \
+	  echo "== $$t"; build/fuzz/tests/fuzz/$$t -max_total_time=$(FUZZ_SECONDS) -timeout=20 -rss_limit_mb=4096 -max_len=20000 \
+	  -print_final_stats=1 -artifact_prefix=build/fuzz/crash-$$n- build/fuzz/corpus/$$n tests/fuzz/corpus/$$n 2>build/fuzz/$$n.log || \
+	  { tail -60 build/fuzz/$$n.log; exit 1; }; \
+	  grep -E 'stat::(number_of_executed|new_units)|^Done' build/fuzz/$$n.log; done
+
+.PHONY: programs-fuzz
+programs-fuzz: $(FUZZ)
+
 check-clang: ## warnings and unit tests with clang 14
 	$(Q)$(MAKE) --no-print-directory CC=clang-14 VARIANT=clang OPENMP=-fopenmp=libomp CFLAGS=-Werror \
 	  build/clang/fbard build/clang/fbar check-unit
 
 check-long: deps-long ## the longer verification: minutes to hours
-	@FBARD_LONG=1 $(MAKE) --no-print-directory check-all check-clang
+	@FBARD_LONG=1 $(MAKE) --no-print-directory check-all check-clang check-tsan
 
-bench: bench-solver bench-recording ## speed: the solver's kernels, then what recording costs
+bench: bench-solver bench-recording bench-status ## speed: the kernels, what recording costs, how fast the daemon answers
 
 bench-solver: $(B)/bench-solver ## kernels against the plain ones, ratios and growth; JSON in build/bench.json
 	$(Q)$< --json build/bench.json $(BENCH)
@@ -232,6 +270,9 @@ bench-peer: ## how to run the same block problem with another code
 
 bench-recording: all ## what journal and recording cost a run, and how fast fbar records
 	$(Q)FBARD=$(CURDIR)/$(B)/fbard FBAR=$(CURDIR)/$(B)/fbar $(PYTHON) bench/recording.py
+
+bench-status: all ## how fast the daemon answers while a run uses all cores, and what that costs the run
+	$(Q)FBARD=$(CURDIR)/$(B)/fbard $(PYTHON) bench/status.py
 
 ## ---- Use ----
 

@@ -11,6 +11,7 @@
 const struct option_spec arguments_global[] = {
     {"url", 0, "URL", "the daemon (default " CLIENT_DEFAULT_URL ", or FBAR_URL)"},
     {"token-file", 0, "FILE", "file that holds the daemon's token"},
+    {"curve-file", 0, "FILE", "keys for an encrypted live stream, from `fbar keygen`"},
     {"json", 0, NULL, "answer in JSON on standard output"},
     {"help", 'h', NULL, "show this help"},
     {"version", 0, NULL, "print the version"},

@@ -22,6 +22,7 @@ struct client {
     const char *url; // borrowed, without a slash at the end
     bool url_given;  // by --url or FBAR_URL, so nothing else may be tried
     const char *token_file;
+    const char *curve_file;   // keys for an encrypted live stream, or NULL
     bool json;                // answer in JSON on standard output
     struct request *requests; // to `url`
 };
@@ -45,4 +46,4 @@ struct command {
 
 extern const struct command cmd_run, cmd_scenes, cmd_validate, cmd_list, cmd_show, cmd_start,
     cmd_pause, cmd_resume, cmd_step, cmd_cancel, cmd_set, cmd_watch, cmd_record, cmd_probes,
-    cmd_info, cmd_plot, cmd_recover, cmd_delete;
+    cmd_info, cmd_plot, cmd_recover, cmd_delete, cmd_keygen;

@@ -12,9 +12,9 @@
 #include "client/terminal.h"
 
 static const struct command *const commands[] = {
-    &cmd_run,    &cmd_scenes, &cmd_validate, &cmd_list,   &cmd_show,    &cmd_start,
-    &cmd_pause,  &cmd_resume, &cmd_step,     &cmd_cancel, &cmd_set,     &cmd_watch,
-    &cmd_record, &cmd_probes, &cmd_info,     &cmd_plot,   &cmd_recover, &cmd_delete,
+    &cmd_run,    &cmd_scenes, &cmd_validate, &cmd_list,   &cmd_show,   &cmd_start,  &cmd_pause,
+    &cmd_resume, &cmd_step,   &cmd_cancel,   &cmd_set,    &cmd_watch,  &cmd_record, &cmd_probes,
+    &cmd_info,   &cmd_plot,   &cmd_recover,  &cmd_delete, &cmd_keygen,
 };
 #define N_COMMANDS (sizeof commands / sizeof *commands)
 
@@ -30,7 +30,7 @@ static void print_options(const struct option_spec *options) {
 
 static void print_help(void) {
     puts("fbar: runs material-point simulations on an fbard daemon, and records them\n\n"
-         "usage: fbar [--url URL] [--token-file FILE] [--json] COMMAND ...\n");
+         "usage: fbar [--url URL] [--token-file FILE] [--curve-file FILE] [--json] COMMAND ...\n");
     for (size_t i = 0; i < N_COMMANDS; i++) {
         char left[64];
         snprintf(left, sizeof left, "%s %s", commands[i]->name, commands[i]->positionals);
@@ -98,6 +98,8 @@ static int run_command(const struct command *command, const struct arguments *gl
         .url_given = given != NULL,
         .token_file = first_of(arguments_value(arguments, "token-file"),
                                arguments_value(global, "token-file")),
+        .curve_file = first_of(arguments_value(arguments, "curve-file"),
+                               arguments_value(global, "curve-file")),
         .json = arguments_flag(arguments, "json") || arguments_flag(global, "json"),
     };
     client.requests = request_create(client.url, client.token_file);

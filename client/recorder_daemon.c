@@ -58,6 +58,20 @@ static void resolve_endpoint(const char *url, const char *publish, char *out, si
     snprintf(out, n, "%s", publish);
 }
 
+// Subscribes with the keys that the publisher calls for; NULL with a sentence in r->why.
+static struct subscription *subscribe(struct recorder *r, const char *endpoint, bool encrypted) {
+    struct subscribe_keys keys;
+    const char *file = r->client->curve_file;
+    if (encrypted && !file) {
+        snprintf(r->why, sizeof r->why, "it is encrypted: --curve-file has the keys");
+        return NULL;
+    }
+    if (encrypted && subscribe_keys_read(file, &keys, r->why, sizeof r->why) != 0)
+        return NULL;
+    return subscribe_open(endpoint, r->options->run, encrypted ? &keys : NULL, r->why,
+                          sizeof r->why);
+}
+
 // Learns the publisher from GET /v1 and subscribes, anew where it has moved.
 enum recorder_outcome recorder_connect(struct recorder *r) {
     struct reply reply;
@@ -71,12 +85,12 @@ enum recorder_outcome recorder_connect(struct recorder *r) {
     resolve_endpoint(r->client->url, recorder_text(endpoints, "publish"), endpoint,
                      sizeof endpoint);
     snprintf(r->code_version, sizeof r->code_version, "%s", recorder_text(about, "version"));
+    const bool encrypted = *recorder_text(endpoints, "publish_key");
     cJSON_Delete(about);
     if (r->subscription && strcmp(endpoint, r->publish) == 0)
         return RECORDER_GOOD;
     subscribe_close(r->subscription);
-    r->subscription =
-        *endpoint ? subscribe_open(endpoint, r->options->run, r->why, sizeof r->why) : NULL;
+    r->subscription = *endpoint ? subscribe(r, endpoint, encrypted) : NULL;
     snprintf(r->publish, sizeof r->publish, "%s", endpoint);
     if (!r->subscription) // polling over HTTP records every frame just as well
         terminal_note("no live stream (%s); fetching frames over HTTP",

@@ -18,7 +18,55 @@ struct subscription {
     char frame_topic[96], event_topic[96];
 };
 
-struct subscription *subscribe_open(const char *endpoint, const char *run, char *why,
+int subscribe_keypair(char *public, char *secret) {
+    return zmq_curve_keypair(public, secret) == 0 ? 0 : -1;
+}
+
+static bool is_key(const char *text) {
+    unsigned char raw[32];
+    return strlen(text) == SUBSCRIBE_KEY - 1 && zmq_z85_decode(raw, text) != NULL;
+}
+
+int subscribe_keys_read(const char *path, struct subscribe_keys *out, char *why, size_t why_bytes) {
+    char line[256], name[32], value[128];
+    FILE *file = fopen(path, "re");
+    *out = (struct subscribe_keys){0};
+    if (!file) {
+        snprintf(why, why_bytes, "%s: %s", path, strerror(errno));
+        return -1;
+    }
+    while (fgets(line, sizeof line, file)) {
+        if (sscanf(line, "%31s %127s", name, value) != 2 || !is_key(value))
+            continue; // a comment, or what keys_complete misses below
+        char *to = strcmp(name, "server") == 0   ? out->server
+                   : strcmp(name, "public") == 0 ? out->public
+                   : strcmp(name, "secret") == 0 ? out->secret
+                                                 : NULL;
+        if (to)
+            memcpy(to, value, SUBSCRIBE_KEY);
+    }
+    fclose(file);
+    if (*out->server && *out->public && *out->secret)
+        return 0;
+    snprintf(
+        why, why_bytes,
+        "%s: must have the lines \"server KEY\", \"public KEY\" and \"secret KEY\", keys of %d "
+        "characters (Z85); lacks %s; fbar keygen makes it",
+        path, SUBSCRIBE_KEY - 1,
+        !*out->server   ? "server"
+        : !*out->public ? "public"
+                        : "secret");
+    return -1;
+}
+
+static bool encrypt(void *socket, const struct subscribe_keys *keys) {
+    return zmq_setsockopt(socket, ZMQ_CURVE_SERVERKEY, keys->server, SUBSCRIBE_KEY) == 0 &&
+           zmq_setsockopt(socket, ZMQ_CURVE_PUBLICKEY, keys->public, SUBSCRIBE_KEY) == 0 &&
+           zmq_setsockopt(socket, ZMQ_CURVE_SECRETKEY, keys->secret, SUBSCRIBE_KEY) == 0;
+}
+
+struct subscription *subscribe_open(const char *endpoint, const char *run,
+                                    const struct subscribe_keys *keys, char *why,
                                     size_t why_bytes) {
     struct subscription *s = calloc(1, sizeof *s);
     if (!s) {
@@ -33,6 +81,7 @@ struct subscription *subscribe_open(const char *endpoint, const char *run, char 
     s->socket = s->context ? zmq_socket(s->context, ZMQ_SUB) : NULL;
     if (!s->socket || zmq_setsockopt(s->socket, ZMQ_RCVHWM, &limit, sizeof limit) != 0 ||
         zmq_setsockopt(s->socket, ZMQ_LINGER, &no_linger, sizeof no_linger) != 0 ||
+        (keys && !encrypt(s->socket, keys)) ||
         zmq_setsockopt(s->socket, ZMQ_SUBSCRIBE, s->frame_topic, strlen(s->frame_topic)) != 0 ||
         zmq_setsockopt(s->socket, ZMQ_SUBSCRIBE, s->event_topic, strlen(s->event_topic)) != 0 ||
         zmq_connect(s->socket, endpoint) != 0) {

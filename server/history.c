@@ -52,6 +52,12 @@ char *history_meta_text(const char *id, const struct history_meta *meta) {
     cJSON_AddStringToObject(json, "scene", meta->name);
     cJSON_AddStringToObject(json, "created", meta->created);
     cJSON_AddStringToObject(json, "version", FBARD_VERSION);
+    if (meta->wait_subscribers > 0)
+        add(json, "wait_subscribers", (double)meta->wait_subscribers);
+    if (meta->key[0] != '\0') {
+        cJSON_AddStringToObject(json, "idempotency_key", meta->key);
+        cJSON_AddStringToObject(json, "request", meta->request);
+    }
     cJSON *list = cJSON_AddArrayToObject(json, "references");
     for (size_t k = 0; k < meta->n_references; k++) {
         const struct run_reference *reference = &meta->references[k];
@@ -81,6 +87,13 @@ bool history_meta_read(const char *given, size_t bytes, struct history_meta *out
     size_t count = (size_t)cJSON_GetArraySize(list);
     bool valid = json != NULL && name != NULL;
     text(json, "created", out->created, sizeof out->created);
+    text(json, "idempotency_key", out->key, sizeof out->key);
+    text(json, "request", out->request, sizeof out->request);
+    const cJSON *wait = json_member(json, "wait_subscribers");
+    out->wait_subscribers =
+        cJSON_IsNumber(wait) && wait->valuedouble > 0 && wait->valuedouble <= RUN_SUBSCRIBERS_MAX
+            ? (uint64_t)wait->valuedouble
+            : 0;
     out->name = strdup(name != NULL ? name : "");
     out->references = calloc(count + 1, sizeof *out->references);
     cJSON_ArrayForEach(item, list) {

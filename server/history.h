@@ -15,7 +15,10 @@ cJSON *history_event(const char *kind, const struct run_status *status);
 
 struct history_meta {
     char created[HISTORY_TIME];
-    char *name; // owned
+    char *name;                // owned
+    uint64_t wait_subscribers; // before its first frame
+    char key[RUN_KEY_MAX + 1]; // Idempotency-Key of its creation, or ""
+    char request[17];          // digest of the body that came with the key
     size_t n_references;
     struct run_reference *references; // owned, with their texts
 };

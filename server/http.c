@@ -1,29 +1,58 @@
-// libmicrohttpd glue: a thread a connection, a bounded number of connections, bodies into memory up
-// to the limit. A body over it is read and thrown away as far as is decent, so that the client gets
-// to see the 413 instead of a reset connection.
+// libmicrohttpd glue: a thread a connection, a bounded number of connections in all and of one
+// address, bodies into memory up to the limit. Who holds a connection without asking anything, or
+// asks slowly, loses it to who comes when places are short. A body over it is read and thrown away
+// as far as is decent, so that the client gets to see the 413 instead of a reset connection.
 #include "server/http.h"
 
 #include <errno.h>
 #include <fcntl.h>
 #include <microhttpd.h>
 #include <netdb.h>
+#include <netinet/in.h>
+#include <netinet/tcp.h>
+#include <poll.h>
+#include <pthread.h>
 #include <stdarg.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 #include <sys/socket.h>
+#include <time.h>
 #include <unistd.h>
 
 #include "server/log.h"
 
-#define CONNECTIONS_MAX 256
+// What libmicrohttpd holds at most: those that are being closed have threads for a while yet, and
+// it drops newcomers at its own limit without an answer.
+#define CONNECTIONS_MAX (HTTP_CONNECTIONS + 784)
+#define SLOW_SECONDS 10  // a reply that takes so long to be read may be given up for others
+#define STOP_SECONDS 2.0 // for what is being answered when the daemon ends
+#define PEER_SECONDS 30  // what was sent and is not acknowledged for so long ends the connection
 #define IDLE_SECONDS 30
 #define BACKLOG 128
 #define DRAIN_MAX ((uint64_t)1 << 30) // bytes of an unwanted body that are read before giving up
 #define STREAM_BLOCK (64 * 1024)
 #define TLS_FILE_MAX (1 << 20)
 
+enum peer_stage {
+    PEER_QUIET, // asks nothing, or has not finished asking
+    PEER_BUSY,  // is being served
+    PEER_REPLYING,
+    PEER_STREAMING,
+};
+// A connection from its acceptance to its end.
+struct peer {
+    struct peer *next;
+    int socket;
+    unsigned char address[16];
+    enum peer_stage stage;
+    double since; // of the stage, or of the last piece of a body
+    bool evicted, refused;
+};
+
 struct http_request {
+    struct http_server *server;
+    struct peer *peer;
     const struct http_service *service;
     struct MHD_Connection *connection;
     const char *method;
@@ -40,6 +69,15 @@ struct http_server {
     struct http_service service;
     char *cert, *key;
     int listener; // closed by quiescing
+    pthread_mutex_t lock;
+    struct peer *peers;
+    struct http_counts counts;
+};
+
+// A body without end, and the socket on which its reader may go away.
+struct endless {
+    struct http_reply reply;
+    int socket;
 };
 
 // ---- What routes call -------------------------------------------------------------------------
@@ -118,6 +156,130 @@ void http_reply_header(struct http_reply *reply, const char *name, const char *f
     reply->headers[reply->n_headers++].name = name;
 }
 
+// ---- Connections ------------------------------------------------------------------------------
+
+static double seconds_now(void) {
+    struct timespec t;
+    clock_gettime(CLOCK_MONOTONIC, &t);
+    return (double)t.tv_sec + 1e-9 * (double)t.tv_nsec;
+}
+
+static void peer_enter(struct http_server *server, struct peer *peer, enum peer_stage stage) {
+    pthread_mutex_lock(&server->lock);
+    peer->stage = stage;
+    peer->since = seconds_now();
+    pthread_mutex_unlock(&server->lock);
+}
+
+static bool same_address(const struct peer *a, const struct peer *b) {
+    return memcmp(a->address, b->address, sizeof a->address) == 0;
+}
+
+// Closes the connection that has asked nothing for longest, or else the one whose reply has been
+// read for longest; of `like`'s address only when that is given. Called with the lock.
+static bool evict(struct http_server *server, const struct peer *newest, const struct peer *like) {
+    struct peer *worst = NULL;
+    double now = seconds_now();
+    for (struct peer *p = server->peers; p != NULL; p = p->next) {
+        bool quiet = p->stage == PEER_QUIET;
+        bool slow = p->stage == PEER_REPLYING && now - p->since > SLOW_SECONDS;
+        if (p == newest || p->evicted || (!quiet && !slow) ||
+            (like != NULL && !same_address(p, like)))
+            continue;
+        if (worst == NULL || (quiet && worst->stage != PEER_QUIET) ||
+            (quiet == (worst->stage == PEER_QUIET) && p->since < worst->since))
+            worst = p;
+    }
+    if (worst == NULL)
+        return false;
+    worst->evicted = true;
+    server->counts.evicted++;
+    shutdown(worst->socket, SHUT_RDWR); // its thread ends by itself
+    return true;
+}
+
+// Called with the lock, for a connection that has just come.
+static void make_place(struct http_server *server, struct peer *newest) {
+    unsigned all = 0, alike = 0;
+    for (const struct peer *p = server->peers; p != NULL; p = p->next)
+        if (!p->evicted && !p->refused) {
+            all++;
+            alike += same_address(p, newest);
+        }
+    if (alike > HTTP_CONNECTIONS_OF_ADDRESS)
+        newest->refused = !evict(server, newest, newest);
+    else if (all > HTTP_CONNECTIONS)
+        newest->refused = !evict(server, newest, NULL);
+    server->counts.refused += newest->refused;
+}
+
+static void address_of(struct MHD_Connection *connection, unsigned char *out) {
+    const union MHD_ConnectionInfo *info =
+        MHD_get_connection_info(connection, MHD_CONNECTION_INFO_CLIENT_ADDRESS);
+    const struct sockaddr *address = info != NULL ? info->client_addr : NULL;
+    memset(out, 0, 16);
+    if (address != NULL && address->sa_family == AF_INET)
+        memcpy(out, &((const struct sockaddr_in *)(const void *)address)->sin_addr, 4);
+    else if (address != NULL && address->sa_family == AF_INET6)
+        memcpy(out, &((const struct sockaddr_in6 *)(const void *)address)->sin6_addr, 8); // a /64
+}
+
+// So that the kernel finds peers that have vanished, also those that we send nothing to.
+static void watch_peer(int socket) {
+    int one = 1, idle = 10, interval = 5, probes = 4, unacknowledged = 1000 * PEER_SECONDS;
+    setsockopt(socket, SOL_SOCKET, SO_KEEPALIVE, &one, sizeof one);
+    setsockopt(socket, IPPROTO_TCP, TCP_KEEPIDLE, &idle, sizeof idle);
+    setsockopt(socket, IPPROTO_TCP, TCP_KEEPINTVL, &interval, sizeof interval);
+    setsockopt(socket, IPPROTO_TCP, TCP_KEEPCNT, &probes, sizeof probes);
+    setsockopt(socket, IPPROTO_TCP, TCP_USER_TIMEOUT, &unacknowledged, sizeof unacknowledged);
+}
+
+static void on_connection(void *cls, struct MHD_Connection *connection, void **context,
+                          enum MHD_ConnectionNotificationCode code) {
+    struct http_server *server = cls;
+    if (code == MHD_CONNECTION_NOTIFY_STARTED) {
+        const union MHD_ConnectionInfo *info =
+            MHD_get_connection_info(connection, MHD_CONNECTION_INFO_CONNECTION_FD);
+        struct peer *peer = calloc(1, sizeof *peer);
+        if (peer == NULL || info == NULL) {
+            free(peer);
+            return; // its requests are refused
+        }
+        peer->socket = info->connect_fd;
+        peer->since = seconds_now();
+        address_of(connection, peer->address);
+        watch_peer(peer->socket);
+        pthread_mutex_lock(&server->lock);
+        peer->next = server->peers;
+        server->peers = peer;
+        server->counts.open++;
+        server->counts.accepted++;
+        make_place(server, peer);
+        pthread_mutex_unlock(&server->lock);
+        *context = peer;
+        return;
+    }
+    struct peer *peer = *context;
+    if (peer == NULL)
+        return;
+    pthread_mutex_lock(&server->lock);
+    for (struct peer **link = &server->peers; *link != NULL; link = &(*link)->next)
+        if (*link == peer) {
+            *link = peer->next;
+            break;
+        }
+    server->counts.open--;
+    pthread_mutex_unlock(&server->lock);
+    free(peer);
+    *context = NULL;
+}
+
+void http_count(struct http_server *server, struct http_counts *out) {
+    pthread_mutex_lock(&server->lock);
+    *out = server->counts;
+    pthread_mutex_unlock(&server->lock);
+}
+
 // ---- Replies ----------------------------------------------------------------------------------
 
 static void reply_clear(struct http_reply *reply) {
@@ -129,26 +291,34 @@ static void reply_clear(struct http_reply *reply) {
     *reply = (struct http_reply){.fd = -1};
 }
 
+// Whether the other side has hung up. While there is nothing to send, nothing else would tell.
+static bool reader_gone(int socket) {
+    struct pollfd item = {.fd = socket, .events = POLLRDHUP};
+    return poll(&item, 1, 0) > 0 && (item.revents & (POLLRDHUP | POLLHUP | POLLERR)) != 0;
+}
+
 static ssize_t produce(void *cls, uint64_t position, char *out, size_t bytes) {
-    struct http_reply *reply = cls;
+    struct endless *own = cls;
     (void)position;
-    size_t n = reply->produce(reply->stream, out, bytes);
-    return n > 0 ? (ssize_t)n : MHD_CONTENT_READER_END_OF_STREAM;
+    size_t n = own->reply.produce(own->reply.stream, out, bytes);
+    if (n == HTTP_END || (n == 0 && reader_gone(own->socket)))
+        return MHD_CONTENT_READER_END_OF_STREAM;
+    return (ssize_t)n;
 }
 
 static void produce_end(void *cls) {
-    struct http_reply *reply = cls;
-    reply_clear(reply);
-    free(reply);
+    struct endless *own = cls;
+    reply_clear(&own->reply);
+    free(own);
 }
 
-static struct MHD_Response *make_response(struct http_reply *reply) {
+static struct MHD_Response *make_response(struct http_reply *reply, int socket) {
     struct MHD_Response *response = NULL;
     if (reply->produce != NULL) {
-        struct http_reply *own = malloc(sizeof *own);
+        struct endless *own = malloc(sizeof *own);
         if (own == NULL)
             return NULL;
-        *own = *reply;
+        *own = (struct endless){.reply = *reply, .socket = socket};
         response = MHD_create_response_from_callback(MHD_SIZE_UNKNOWN, STREAM_BLOCK, produce, own,
                                                      produce_end);
         if (response == NULL)
@@ -170,9 +340,15 @@ static struct MHD_Response *make_response(struct http_reply *reply) {
 
 static enum MHD_Result send_reply(struct http_request *q) {
     struct http_reply *reply = &q->reply;
-    struct MHD_Response *response = make_response(reply);
+    bool endless = reply->produce != NULL;
+    struct MHD_Response *response = make_response(reply, q->peer->socket);
     if (response == NULL)
         return MHD_NO;
+    if (endless || q->peer->refused)
+        MHD_add_response_header(response, "Connection", "close");
+    if (endless) // it is quiet while the run is; a peer that is gone is the kernel's to find
+        MHD_set_connection_option(q->connection, MHD_CONNECTION_OPTION_TIMEOUT, 0u);
+    peer_enter(q->server, q->peer, endless ? PEER_STREAMING : PEER_REPLYING);
     if (reply->type != NULL)
         MHD_add_response_header(response, "Content-Type", reply->type);
     MHD_add_response_header(response, "Cache-Control", "no-store");
@@ -191,9 +367,14 @@ static enum MHD_Result send_reply(struct http_request *q) {
 static void *on_target(void *cls, const char *target, struct MHD_Connection *connection) {
     struct http_server *server = cls;
     struct http_request *q = calloc(1, sizeof *q);
-    (void)connection;
-    if (q == NULL)
+    const union MHD_ConnectionInfo *info =
+        MHD_get_connection_info(connection, MHD_CONNECTION_INFO_SOCKET_CONTEXT);
+    if (q == NULL || info == NULL || info->socket_context == NULL) {
+        free(q);
         return NULL;
+    }
+    q->server = server;
+    q->peer = info->socket_context;
     q->service = &server->service;
     q->reply.fd = -1;
     q->path = strdup(target);
@@ -210,6 +391,7 @@ static void on_completed(void *cls, struct MHD_Connection *connection, void **re
     (void)code;
     if (q == NULL)
         return;
+    peer_enter(q->server, q->peer, PEER_QUIET);
     reply_clear(&q->reply);
     free(q->path);
     free(q->body);
@@ -230,7 +412,12 @@ static enum MHD_Result begin(struct http_request *q) {
     const char *text = http_header(q, "Content-Length"), *expect = http_header(q, "Expect");
     uint64_t length = text != NULL ? strtoull(text, NULL, 10) : 0;
     q->begun = true;
-    q->refused = !q->service->admit(q->service->context, q, &q->reply);
+    if (q->peer->refused) {
+        q->refused = true;
+        q->service->too_many(q->service->context, &q->reply);
+    } else {
+        q->refused = !q->service->admit(q->service->context, q, &q->reply);
+    }
     if (!q->refused && length > q->service->max_body)
         refuse_size(q);
     // A client that asks first, or sends more than is decent to read, is told at once.
@@ -269,6 +456,7 @@ static enum MHD_Result on_request(void *cls, struct MHD_Connection *connection, 
         return begin(q);
     if (*upload_bytes > 0) {
         q->drained += *upload_bytes;
+        peer_enter(q->server, q->peer, PEER_QUIET); // makes progress
         if (!q->refused && q->drained > q->service->max_body)
             refuse_size(q);
         if (q->refused ? q->drained > DRAIN_MAX : !body_append(q, upload, *upload_bytes))
@@ -278,6 +466,7 @@ static enum MHD_Result on_request(void *cls, struct MHD_Connection *connection, 
     }
     if (q->replied)
         return MHD_YES;
+    peer_enter(q->server, q->peer, PEER_BUSY);
     if (!q->refused)
         q->service->serve(q->service->context, q, &q->reply);
     return send_reply(q);
@@ -346,6 +535,7 @@ struct http_server *http_start(const struct http_address *address,
         return NULL;
     server->service = *service;
     server->listener = -1;
+    pthread_mutex_init(&server->lock, NULL);
     if (tls && ((server->cert = file_text(address->tls_cert, why, why_bytes)) == NULL ||
                 (server->key = file_text(address->tls_key, why, why_bytes)) == NULL))
         goto fail;
@@ -364,8 +554,8 @@ struct http_server *http_start(const struct http_address *address,
         0, NULL, NULL, on_request, server, MHD_OPTION_EXTERNAL_LOGGER, on_log, NULL,
         MHD_OPTION_LISTEN_SOCKET, server->listener, MHD_OPTION_CONNECTION_LIMIT, CONNECTIONS_MAX,
         MHD_OPTION_CONNECTION_TIMEOUT, IDLE_SECONDS, MHD_OPTION_URI_LOG_CALLBACK, on_target, server,
-        MHD_OPTION_NOTIFY_COMPLETED, on_completed, NULL, MHD_OPTION_ARRAY, tls ? secure : plain,
-        MHD_OPTION_END);
+        MHD_OPTION_NOTIFY_COMPLETED, on_completed, NULL, MHD_OPTION_NOTIFY_CONNECTION,
+        on_connection, server, MHD_OPTION_ARRAY, tls ? secure : plain, MHD_OPTION_END);
     if (server->daemon != NULL)
         return server;
     snprintf(why, why_bytes,
@@ -386,10 +576,27 @@ void http_quiesce(struct http_server *server) {
         close(listener);
 }
 
+// libmicrohttpd cuts connections where they stand; what is being answered gets a moment to be read.
+static void wait_for_replies(struct http_server *server) {
+    double until = seconds_now() + STOP_SECONDS;
+    bool busy = true;
+    while (busy && seconds_now() < until) {
+        busy = false;
+        pthread_mutex_lock(&server->lock);
+        for (const struct peer *p = server->peers; p != NULL && !busy; p = p->next)
+            busy = p->stage != PEER_QUIET && !p->evicted;
+        pthread_mutex_unlock(&server->lock);
+        if (busy)
+            nanosleep(&(struct timespec){.tv_nsec = 10000000}, NULL);
+    }
+}
+
 void http_stop(struct http_server *server) {
     if (server == NULL)
         return;
+    wait_for_replies(server);
     MHD_stop_daemon(server->daemon);
+    pthread_mutex_destroy(&server->lock);
     free(server->cert);
     free(server->key);
     free(server);

@@ -6,6 +6,7 @@
 #include <stdint.h>
 
 #define HTTP_HEADERS_MAX 8
+#define HTTP_END SIZE_MAX
 
 struct http_request;
 const char *http_method(const struct http_request *request);
@@ -25,8 +26,9 @@ struct http_reply {
     size_t bytes;
     int fd; // >= 0: the body is `bytes` bytes of it from `offset`; the server closes it
     uint64_t offset;
-    // Not NULL: a body without end. Returns how many bytes it wrote, 0 at the end; may block for
-    // about a second. `close` ends it.
+    // Not NULL: a body without end, after which the connection is closed. Returns how many bytes it
+    // wrote, HTTP_END at the end, 0 when there is nothing now: then it is asked again at once, so
+    // it may block for about a second. `close` ends it.
     size_t (*produce)(void *stream, char *out, size_t bytes);
     void (*close)(void *stream);
     void *stream;
@@ -48,16 +50,29 @@ struct http_service {
     void (*serve)(void *context, struct http_request *request, struct http_reply *reply);
     // Fills the reply to a body over the limit.
     void (*too_large)(void *context, struct http_reply *reply);
+    // Fills the reply on a connection for which there is no place.
+    void (*too_many)(void *context, struct http_reply *reply);
 };
 struct http_address {
     const char *host, *port;        // port "0" picks one
     const char *tls_cert, *tls_key; // files, or NULL
 };
 
+struct http_counts {
+    unsigned open;
+    uint64_t accepted, evicted, refused; // connections
+};
+
+// At most so many connections, and of one address. Beyond that the one is closed that has been
+// without a request for longest; where all are busy, requests are answered with 503.
+#define HTTP_CONNECTIONS 240
+#define HTTP_CONNECTIONS_OF_ADDRESS 192
+
 struct http_server;
 // `url` receives "http://127.0.0.1:40123". NULL with a sentence in `why`.
 struct http_server *http_start(const struct http_address *address,
                                const struct http_service *service, char *url, size_t url_bytes,
                                char *why, size_t why_bytes);
+void http_count(struct http_server *server, struct http_counts *out);
 void http_quiesce(struct http_server *server); // accepts no more connections
 void http_stop(struct http_server *server);    // after the replies under way

@@ -81,9 +81,9 @@ enum journal_result journal_append_event(struct journal *j, const char *json, ch
         (void)ignored;
         return journal_failure(error, j->folder, why);
     }
-    j->event_bytes += whole;
     j->event_check = check;
     pthread_mutex_lock(&j->lock);
+    j->event_bytes += whole; // written by this thread alone, which needs no lock to read it
     j->n_events++;
     pthread_mutex_unlock(&j->lock);
     return JOURNAL_OK;
@@ -94,4 +94,34 @@ uint64_t journal_n_events(struct journal *j) {
     uint64_t n = j->n_events;
     pthread_mutex_unlock(&j->lock);
     return n;
+}
+
+#define EVENT_BLOCK 4096 // longer than almost every line
+
+char *journal_event_next(struct journal *j, uint64_t *offset) {
+    pthread_mutex_lock(&j->lock);
+    uint64_t end = j->event_bytes;
+    pthread_mutex_unlock(&j->lock);
+    for (size_t bytes = EVENT_BLOCK; *offset < end; bytes *= 4) {
+        if (bytes > end - *offset)
+            bytes = (size_t)(end - *offset);
+        char *text = malloc(bytes + 1);
+        if (text == NULL || journal_read_at(j->events, text, bytes, *offset) != 0) {
+            free(text);
+            return NULL;
+        }
+        const char *newline = memchr(text, '\n', bytes);
+        size_t line = newline != NULL ? (size_t)(newline - text) : 0;
+        if (newline != NULL && line > CHECK_BYTES) {
+            size_t stem = line - CHECK_BYTES;
+            stem -= text[stem - 1] == ','; // what the check came behind
+            memcpy(text + stem, "}", 2);
+            *offset += line + 1;
+            return text;
+        }
+        free(text);
+        if (newline != NULL || bytes == end - *offset)
+            return NULL;
+    }
+    return NULL;
 }

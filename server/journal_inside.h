@@ -24,9 +24,9 @@ struct journal {
     int tail;   // the last segment, -1 before the first frame
     uint64_t cut_bytes;
     atomic_bool power;    // every entry is fsynced before it counts
-    uint64_t event_bytes; // of whole lines; only the run's thread appends
     uint64_t event_check; // of the last line
     pthread_mutex_t lock; // over what follows
+    uint64_t event_bytes; // of whole lines; only the run's thread appends
     uint64_t n_events;
     struct journal_segment *segments;
     size_t n_segments, segments_capacity;

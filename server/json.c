@@ -10,6 +10,7 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <xxhash.h>
 
 // ---- Faults -------------------------------------------------------------------------------------
 
@@ -335,10 +336,10 @@ static int compare_open_keys(const void *a, const void *b) {
 // Sorted rather than hashed, so that no choice of keys makes it quadratic. The first repetition in
 // the text is the one reported.
 static bool keys_differ(struct reader *r, size_t base) {
-    struct open_key *keys = r->keys + base;
     size_t n = r->n_keys - base, first = SIZE_MAX;
     if (n < 2)
         return true;
+    struct open_key *keys = r->keys + base;
     qsort(keys, n, sizeof *keys, compare_open_keys);
     for (size_t i = 1; i < n; i++)
         if (strcmp(keys[i - 1].key, keys[i].key) == 0 && keys[i].offset < first)
@@ -648,4 +649,8 @@ char *json_print(const cJSON *json, bool indented) {
         text = indented ? cJSON_Print(copy) : cJSON_PrintUnformatted(copy);
     cJSON_Delete(copy);
     return text;
+}
+
+void json_digest(const char *text, char *out) {
+    snprintf(out, JSON_DIGEST, "%016llx", (unsigned long long)XXH3_64bits(text, strlen(text)));
 }

@@ -43,6 +43,9 @@ void json_pointer_append(char *out, size_t n, const char *token);
 // A new number object that prints with the fewest digits that read back to the same double; null
 // when the value is not finite.
 cJSON *json_number(double value);
+// XXH3-64 of a text, in hexadecimal.
+#define JSON_DIGEST 17
+void json_digest(const char *text, char *out);
 // The text of a value, freed with free: every number with the fewest digits that read back to the
 // same double, which cJSON's own printing does not promise.
 char *json_print(const cJSON *json, bool indented);

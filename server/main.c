@@ -48,13 +48,17 @@ static int run_daemon(const struct options *options, const sigset_t *signals) {
     struct routes routes = {.options = options};
     struct run_host host = {.data_dir = options->data_dir,
                             .threads = options->threads,
+                            .isa = options->isa,
                             .memory_limit = options->memory_limit};
     struct http_server *http = NULL;
+    struct run_meters meters = {0};
+    host.meters = &meters;
     if (!guard_init(&routes.guard, options->http_host, options->token_file, why, sizeof why))
         goto done;
     host.slots = slots_create(options->slots, options->memory_limit);
     host.publisher =
-        publish_start(options->publish, routes.publish_url, sizeof routes.publish_url, why);
+        publish_start(options->publish, options->curve_dir[0] != '\0' ? options->curve_dir : NULL,
+                      routes.publish_url, sizeof routes.publish_url, routes.publish_key, why);
     routes.host = &host;
     routes.runs = runs_create(&host, options->slots, options->queue);
     if (host.slots == NULL || host.publisher == NULL || routes.runs == NULL)
@@ -67,13 +71,15 @@ static int run_daemon(const struct options *options, const sigset_t *signals) {
                       &service, routes.http_url, sizeof routes.http_url, why, sizeof why);
     if (http == NULL)
         goto done;
+    routes.http = http;
     runs_restore(routes.runs, restore_mode(options->resume));
     atomic_store(&routes.open, true);
     if (options->port_file[0] != '\0' && !port_file_write(options->port_file, &routes)) {
         why[0] = '\0';
     } else {
-        log_info("ready", "http=%s publish=%s data_dir=\"%s\" threads=%d slots=%d", routes.http_url,
-                 routes.publish_url, options->data_dir, options->threads, options->slots);
+        log_info("ready", "http=%s publish=%s data_dir=\"%s\" threads=%d slots=%d isa=%s",
+                 routes.http_url, routes.publish_url, options->data_dir, options->threads,
+                 options->slots, mpm_isa_name(mpm_isa_in_use(options->isa)));
         sigwait(signals, &received);
         log_info("ending", "signal=%d", received);
         status = 0;

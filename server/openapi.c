@@ -28,7 +28,7 @@ static const struct {
     {"503", "not now; Retry-After says when"},
     {"507", "the disk refuses"},
 };
-static const char everywhere[] = "401 403 405 421";
+static const char everywhere[] = "401 403 405 421 503";
 
 static const struct {
     const char *name, *json;
@@ -81,7 +81,7 @@ static const struct {
      "Za-z0-9._-]{0,63}$\"},\"recorders\":{\"type\":\"array\",\"items\":{\"type\":\"string\"},"
      "\"maxItems\":64},"
      "\"start\":{\"type\":\"boolean\",\"default\":true},\"wait_subscri"
-     "bers\":{\"type\":\"integer\",\"const\":0}}}"},
+     "bers\":{\"type\":\"integer\",\"minimum\":0,\"maximum\":10000,\"default\":0}}}"},
     {"State",
      "{\"enum\":[\"queued\",\"running\",\"waiting\",\"paused\",\"completed\",\"failed\",\"ca"
      "ncelled\"]}"},
@@ -117,6 +117,7 @@ static const struct {
             "ay\",\"items\":{\"type\":\"object\",\"required\":[\"probe\",\"value\",\"reference\",\""
             "relative_error\",\"source\"]}},\"effective_step\":{\"type\":\"integer\"},\"frame_seq\""
             ":{\"type\":\"integer\"}}}"},
+    {"Text", "{\"type\":\"string\"}"},
     {"Runs",
      "{\"type\":\"object\",\"required\":[\"runs\"],\"properties\":{\"runs\":{\"type\":\"arra"
      "y\",\"items\":{\"$ref\":\"#/components/schemas/Run\"}}}}"},
@@ -209,14 +210,16 @@ static void add_parameters(cJSON *operation, const struct route *route) {
         snprintf(name, sizeof name, "%.*s", (int)strcspn(open + 1, "}"), open + 1);
         add_parameter(list, "path", name, NULL);
     }
-    if (route->query != NULL) {
-        char text[200], *rest = text;
-        snprintf(text, sizeof text, "%s", route->query);
+    if (route->parameters != NULL) {
+        char text[600], *rest = text;
+        snprintf(text, sizeof text, "%s", route->parameters);
         for (char *line; (line = strsep(&rest, "\n")) != NULL;) {
             char *colon = strstr(line, ": ");
             if (colon != NULL) {
                 *colon = '\0';
-                add_parameter(list, "query", line, colon + 2);
+                bool header = strncmp(line, "header ", 7) == 0;
+                add_parameter(list, header ? "header" : "query", header ? line + 7 : line,
+                              colon + 2);
             }
         }
     }

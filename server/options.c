@@ -136,7 +136,7 @@ static bool parse_resume(const char *text, enum options_resume *out) {
     X(TOKEN_FILE, "--token-file", "FILE", "every request must carry this bearer token")            \
     X(TLS_CERT, "--tls-cert", "FILE", "serve HTTPS with this certificate (PEM)")                   \
     X(TLS_KEY, "--tls-key", "FILE", "its key (PEM)")                                               \
-    X(CURVE_DIR, "--curve-dir", "DIR", "encrypted ZeroMQ: not in this version")                    \
+    X(CURVE_DIR, "--curve-dir", "DIR", "encrypt ZeroMQ with the keys of fbar keygen DIR")          \
     X(PORT_FILE, "--port-file", "FILE", "receives {\"http\": ..., \"publish\": ...} when ready")   \
     X(MEMORY_LIMIT, "--memory-limit", "BYTES", "of all simulations; suffix K, M, G (80 % of RAM)") \
     X(MAX_BODY, "--max-body", "BYTES", "largest request body (8M)")                                \
@@ -168,6 +168,10 @@ static void print_help(char *message, size_t n) {
                  table[k].value != NULL ? table[k].value : "");
         used += (size_t)snprintf(message + used, n - used, "  %-26s %s\n", left, table[k].doc);
     }
+    if (used < n)
+        snprintf(message + used, n - used,
+                 "\nFBARD_ISA in the environment: auto, baseline, avx2 or avx512: the solver's "
+                 "instruction set.\n");
 }
 
 static bool assign(struct options *o, enum option option, const char *value) {
@@ -192,6 +196,8 @@ static bool assign(struct options *o, enum option option, const char *value) {
         return *value != '\0' && copy(o->tls_cert, sizeof o->tls_cert, value);
     case OPTION_TLS_KEY:
         return *value != '\0' && copy(o->tls_key, sizeof o->tls_key, value);
+    case OPTION_CURVE_DIR:
+        return *value != '\0' && copy(o->curve_dir, sizeof o->curve_dir, value);
     case OPTION_PORT_FILE:
         return *value != '\0' && copy(o->port_file, sizeof o->port_file, value);
     case OPTION_MEMORY_LIMIT:
@@ -201,7 +207,6 @@ static bool assign(struct options *o, enum option option, const char *value) {
     case OPTION_INSECURE:
         o->insecure = true;
         return true;
-    case OPTION_CURVE_DIR:
     case OPTION_HELP:
     case OPTION_VERSION:
     case N_OPTIONS:
@@ -229,7 +234,31 @@ static bool default_data_dir(struct options *o) {
     return n < (int)sizeof o->data_dir;
 }
 
+// FBARD_ISA chooses the solver's kernels, for comparisons and for a processor that throttles.
+static bool isa_from_environment(struct options *o, char *message, size_t n) {
+    const char *text = getenv("FBARD_ISA");
+    int isa = text != NULL && *text != '\0' ? mpm_isa_parse(text) : MPM_ISA_AUTO;
+    if (isa < 0) {
+        size_t used = (size_t)snprintf(message, n, "FBARD_ISA: must be one of");
+        for (int k = 0; k < MPM_N_ISAS && used < n; k++)
+            used +=
+                (size_t)snprintf(message + used, n - used, " %s", mpm_isa_name((enum mpm_isa)k));
+        if (used < n)
+            snprintf(message + used, n - used, ", got '%.60s'", text);
+        return false;
+    }
+    if (!mpm_isa_available((enum mpm_isa)isa)) {
+        snprintf(message, n, "FBARD_ISA: this processor or build has no %s; it has %s", text,
+                 mpm_isa_name(mpm_isa_in_use(MPM_ISA_AUTO)));
+        return false;
+    }
+    o->isa = (enum mpm_isa)isa;
+    return true;
+}
+
 static bool complete(struct options *o, char *message, size_t n) {
+    if (!isa_from_environment(o, message, n))
+        return false;
     if (o->data_dir[0] == '\0' && !default_data_dir(o)) {
         snprintf(message, n, "no --data-dir, and neither XDG_STATE_HOME nor HOME names a folder");
         return false;
@@ -246,11 +275,12 @@ static bool complete(struct options *o, char *message, size_t n) {
                  o->http_host);
         return false;
     }
-    if (!o->publish_loopback && !o->insecure) {
-        snprintf(message, n,
-                 "--publish %s is beyond loopback, and this version has no CURVE: give --insecure "
-                 "to publish in the clear",
-                 o->publish);
+    if (!o->publish_loopback && o->curve_dir[0] == '\0' && !o->insecure) {
+        snprintf(
+            message, n,
+            "--publish %s is beyond loopback: give --curve-dir (fbar keygen), or --insecure to "
+            "publish in the clear",
+            o->publish);
         return false;
     }
     if (o->threads == 0)
@@ -288,10 +318,6 @@ enum options_result options_parse(int argc, char *const *argv, struct options *o
         if (option == OPTION_VERSION) {
             snprintf(message, message_bytes, "fbard %s\n", FBARD_VERSION);
             return OPTIONS_PRINTED;
-        }
-        if (option == OPTION_CURVE_DIR) {
-            snprintf(message, message_bytes, "--curve-dir: this version has no CURVE encryption");
-            return OPTIONS_BAD;
         }
         const char *value = equals != NULL ? equals + 1 : NULL;
         if (table[option].value == NULL && value != NULL) {

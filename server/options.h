@@ -4,6 +4,8 @@
 #include <stddef.h>
 #include <stdint.h>
 
+#include "server/mpm/mpm.h"
+
 enum options_resume { OPTIONS_RESUME_AUTO, OPTIONS_RESUME_PAUSED, OPTIONS_RESUME_OFF };
 
 struct options {
@@ -12,13 +14,14 @@ struct options {
     char publish[300]; // a ZeroMQ endpoint
     bool publish_loopback;
     char data_dir[4096 - 256]; // room for the files inside within PATH_MAX
-    char token_file[4096], tls_cert[4096], tls_key[4096], port_file[4096];
+    char token_file[4096], tls_cert[4096], tls_key[4096], port_file[4096], curve_dir[4000];
     enum options_resume resume;
     bool insecure;
     int threads;                   // solver threads of one run
     int slots;                     // runs at a time
     int queue;                     // runs that may wait for a slot
     size_t memory_limit, max_body; // bytes
+    enum mpm_isa isa;              // of the solver's kernels, from FBARD_ISA
 };
 
 enum options_result { OPTIONS_RUN, OPTIONS_PRINTED, OPTIONS_BAD };

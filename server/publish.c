@@ -1,5 +1,5 @@
-// One thread, one PUB socket, one queue a run. Order of a frame: digest, journal, socket; so
-// nothing is ever seen on the wire that a crash could take back.
+// One thread, one PUB socket (XPUB, which also tells who subscribes), one queue a run. Order of a
+// frame: digest, journal, socket; so nothing is ever seen on the wire that a crash could take back.
 //
 // A frame's memory is free again as soon as the journal has it. What ZeroMQ sends is a mapping of
 // the journal's file, so that subscribers that stall, each at its own frame, hold pages of the file
@@ -16,12 +16,16 @@
 
 #include "proto/frame.h"
 #include "server/log.h"
+#include "server/zap.h"
 
 #define SEND_HIGH_WATER 8 // messages a subscriber may lag before it loses some
 #define LINGER_MS 1000
-#define RETRY_SECONDS 0.5 // between two tries on a full disk
-#define LOG_SECONDS 60    // between two lines about the same trouble
-#define EVENTS_MAX 256    // queued events of a run; the log has them all
+#define RETRY_SECONDS 0.5  // between two tries on a full disk
+#define LOG_SECONDS 60     // between two lines about the same trouble
+#define EVENTS_MAX 256     // queued events of a run; the log has them all
+#define AWAIT_SECONDS 0.02 // between two looks for subscriptions while a run waits for them
+#define TOPIC_MAX 80       // bytes; a longer one matches nothing
+#define TOPICS_MAX 4096 // different ones that are counted; bounds what subscribers can make us hold
 
 struct item {
     struct item *next;
@@ -40,19 +44,31 @@ struct outlet {
     struct item *first, *last;
     unsigned n_frames, n_events;
     bool busy; // the thread is at work on one of its items
+    bool awaits;
     enum journal_result status;
     struct timespec retry, log_again;
     char why[JOURNAL_WHY];
 };
 
+struct topic {
+    char text[TOPIC_MAX];
+    size_t bytes;
+    uint64_t count;
+};
+
 struct publisher {
     void *context, *socket;
+    struct zap *zap; // NULL: not encrypted
     pthread_t thread;
     pthread_mutex_t lock;
     pthread_cond_t work, done; // both on CLOCK_MONOTONIC
     struct outlet *outlets;
     struct outlet *turn; // whose item was taken last
     bool stop;
+    unsigned n_awaiting; // outlets
+    struct topic *topics;
+    size_t n_topics, topics_capacity;
+    struct publish_counts counts;
 };
 
 // ---- Buffers ----------------------------------------------------------------------------------
@@ -85,7 +101,7 @@ static void message_free(void *bytes, void *hint) {
     free(map);
 }
 
-// ---- The thread -------------------------------------------------------------------------------
+// ---- Sending -----------------------------------------------------------------------------------
 
 static struct timespec after(double seconds) {
     struct timespec t;
@@ -116,20 +132,30 @@ static void send_frame(struct publisher *p, const struct outlet *outlet, uint64_
         free(map); // subscribers see the gap and fetch it
         return;
     }
+    const uint64_t bytes = map->bytes; // the map is gone once it is sent
     if (zmq_msg_init_data(&message, map->frame, map->bytes, message_free, map) != 0) {
         message_free(NULL, map);
         return;
     }
     if (zmq_send(p->socket, outlet->frame_topic, strlen(outlet->frame_topic),
                  ZMQ_SNDMORE | ZMQ_DONTWAIT) < 0 ||
-        zmq_msg_send(&message, p->socket, ZMQ_DONTWAIT) < 0)
+        zmq_msg_send(&message, p->socket, ZMQ_DONTWAIT) < 0) {
         zmq_msg_close(&message);
+        return;
+    }
+    pthread_mutex_lock(&p->lock);
+    p->counts.frames++;
+    p->counts.frame_bytes += bytes;
+    pthread_mutex_unlock(&p->lock);
 }
 
 static void send_event(struct publisher *p, const struct outlet *outlet, const char *json) {
     if (zmq_send(p->socket, outlet->event_topic, strlen(outlet->event_topic),
                  ZMQ_SNDMORE | ZMQ_DONTWAIT) >= 0)
         zmq_send(p->socket, json, strlen(json), ZMQ_DONTWAIT);
+    pthread_mutex_lock(&p->lock);
+    p->counts.events++;
+    pthread_mutex_unlock(&p->lock);
 }
 
 static void announce_gone(struct publisher *p, struct outlet *outlet, uint64_t before) {
@@ -143,6 +169,80 @@ static void announce_gone(struct publisher *p, struct outlet *outlet, uint64_t b
     log_warn("frames_dropped", "topic=%s from=%llu to=%llu", outlet->frame_topic,
              (unsigned long long)before, (unsigned long long)gone - 1);
 }
+
+// ---- Who subscribes ---------------------------------------------------------------------------
+
+// A subscription (1) or the end of one (0). Called with the lock.
+static void note_subscription(struct publisher *p, bool begins, const char *text, size_t bytes) {
+    size_t k = 0;
+    while (k < p->n_topics &&
+           (p->topics[k].bytes != bytes || memcmp(p->topics[k].text, text, bytes) != 0))
+        k++;
+    if (k == p->n_topics) {
+        if (!begins || p->n_topics == TOPICS_MAX)
+            return;
+        if (p->n_topics == p->topics_capacity) {
+            size_t larger = p->topics_capacity == 0 ? 16 : 2 * p->topics_capacity;
+            struct topic *moved = realloc(p->topics, larger * sizeof *moved);
+            if (moved == NULL)
+                return;
+            p->topics = moved;
+            p->topics_capacity = larger;
+        }
+        p->topics[k] = (struct topic){.bytes = bytes};
+        memcpy(p->topics[k].text, text, bytes);
+        p->n_topics++;
+    }
+    p->counts.subscriptions += begins ? 1 : (uint64_t)-1;
+    p->topics[k].count += begins ? 1 : (uint64_t)-1;
+    if (p->topics[k].count == 0)
+        p->topics[k] = p->topics[--p->n_topics];
+}
+
+// Takes what subscribers have told. Called with the lock, which it gives up while it asks.
+static void read_subscriptions(struct publisher *p) {
+    char message[1 + TOPIC_MAX];
+    for (;;) {
+        pthread_mutex_unlock(&p->lock);
+        int n = zmq_recv(p->socket, message, sizeof message, ZMQ_DONTWAIT);
+        pthread_mutex_lock(&p->lock);
+        if (n < 0)
+            return;
+        if (n > 0 && (size_t)n <= sizeof message && (message[0] == 0 || message[0] == 1))
+            note_subscription(p, message[0] == 1, message + 1, (size_t)n - 1);
+    }
+}
+
+uint64_t publish_subscribers(struct outlet *o) {
+    uint64_t count = 0;
+    pthread_mutex_lock(&o->publisher->lock);
+    for (size_t k = 0; k < o->publisher->n_topics; k++) {
+        const struct topic *topic = &o->publisher->topics[k];
+        if (topic->bytes <= strlen(o->frame_topic) &&
+            memcmp(topic->text, o->frame_topic, topic->bytes) == 0)
+            count += topic->count;
+    }
+    pthread_mutex_unlock(&o->publisher->lock);
+    return count;
+}
+
+void publish_await(struct outlet *o, bool awaits) {
+    pthread_mutex_lock(&o->publisher->lock);
+    if (awaits != o->awaits) {
+        o->awaits = awaits;
+        o->publisher->n_awaiting += awaits ? 1 : (unsigned)-1;
+        pthread_cond_signal(&o->publisher->work);
+    }
+    pthread_mutex_unlock(&o->publisher->lock);
+}
+
+void publish_count(struct publisher *p, struct publish_counts *out) {
+    pthread_mutex_lock(&p->lock);
+    *out = p->counts;
+    pthread_mutex_unlock(&p->lock);
+}
+
+// ---- The thread -------------------------------------------------------------------------------
 
 // The next item that may be worked on, of the outlets in turn.
 static struct outlet *next_outlet(struct publisher *p) {
@@ -226,6 +326,7 @@ static void *publisher_thread(void *argument) {
     struct publisher *p = argument;
     pthread_mutex_lock(&p->lock);
     for (;;) {
+        read_subscriptions(p);
         struct outlet *o = next_outlet(p);
         if (o != NULL) {
             work_on(p, o);
@@ -233,7 +334,7 @@ static void *publisher_thread(void *argument) {
         }
         if (p->stop)
             break;
-        struct timespec until = after(RETRY_SECONDS);
+        struct timespec until = after(p->n_awaiting > 0 ? AWAIT_SECONDS : RETRY_SECONDS);
         pthread_cond_timedwait(&p->work, &p->lock, &until);
     }
     pthread_mutex_unlock(&p->lock);
@@ -251,8 +352,33 @@ static void condition_init(pthread_cond_t *condition) {
     pthread_condattr_destroy(&attributes);
 }
 
-struct publisher *publish_start(const char *address, char *endpoint, size_t endpoint_bytes,
-                                char *why) {
+// In draft interfaces of libzmq only. Without it, a socket whose ZAP handler is gone would admit
+// anybody; ours is there as long as the socket.
+#ifndef ZMQ_ZAP_ENFORCE_DOMAIN
+#define ZMQ_ZAP_ENFORCE_DOMAIN 93
+#endif
+
+// Encrypts the socket and has zap.c asked who may subscribe.
+static bool encrypt(struct publisher *p, const char *folder, char *key, char *why) {
+    char secret[ZAP_KEY];
+    int one = 1;
+    p->zap = zap_start(p->context, folder, key, secret, why);
+    if (p->zap == NULL)
+        return false;
+    bool set = zmq_setsockopt(p->socket, ZMQ_CURVE_SERVER, &one, sizeof one) == 0 &&
+               zmq_setsockopt(p->socket, ZMQ_CURVE_SECRETKEY, secret, sizeof secret) == 0 &&
+               zmq_setsockopt(p->socket, ZMQ_ZAP_DOMAIN, ZAP_DOMAIN, strlen(ZAP_DOMAIN)) == 0;
+    explicit_bzero(secret, sizeof secret);
+    if (!set)
+        snprintf(why, JOURNAL_WHY, "--curve-dir: %s", zmq_strerror(errno));
+    else if (zmq_setsockopt(p->socket, ZMQ_ZAP_ENFORCE_DOMAIN, &one, sizeof one) != 0)
+        log_line(LOG_LEVEL_DEBUG, "zap", "enforced_by=handler");
+    return set;
+}
+
+struct publisher *publish_start(const char *address, const char *curve_dir, char *endpoint,
+                                size_t endpoint_bytes, char *key, char *why) {
+    key[0] = '\0';
     struct publisher *p = calloc(1, sizeof *p);
     if (p == NULL) {
         snprintf(why, JOURNAL_WHY, "out of memory");
@@ -261,12 +387,16 @@ struct publisher *publish_start(const char *address, char *endpoint, size_t endp
     pthread_mutex_init(&p->lock, NULL);
     condition_init(&p->work);
     condition_init(&p->done);
-    int linger = LINGER_MS, high_water = SEND_HIGH_WATER, v6 = strchr(address, '[') != NULL;
+    int linger = LINGER_MS, high_water = SEND_HIGH_WATER, one = 1,
+        v6 = strchr(address, '[') != NULL;
     p->context = zmq_ctx_new();
-    p->socket = p->context != NULL ? zmq_socket(p->context, ZMQ_PUB) : NULL;
+    p->socket = p->context != NULL ? zmq_socket(p->context, ZMQ_XPUB) : NULL;
+    if (p->socket != NULL && curve_dir != NULL && !encrypt(p, curve_dir, key, why))
+        goto fail;
     if (p->socket == NULL || zmq_setsockopt(p->socket, ZMQ_LINGER, &linger, sizeof linger) != 0 ||
         zmq_setsockopt(p->socket, ZMQ_SNDHWM, &high_water, sizeof high_water) != 0 ||
         zmq_setsockopt(p->socket, ZMQ_IPV6, &v6, sizeof v6) != 0 ||
+        zmq_setsockopt(p->socket, ZMQ_XPUB_VERBOSER, &one, sizeof one) != 0 ||
         zmq_bind(p->socket, address) != 0 ||
         zmq_getsockopt(p->socket, ZMQ_LAST_ENDPOINT, endpoint, &endpoint_bytes) != 0) {
         snprintf(why, JOURNAL_WHY, "cannot publish on %s: %s", address, zmq_strerror(errno));
@@ -283,6 +413,7 @@ fail:
         zmq_close(p->socket);
     if (p->context != NULL)
         zmq_ctx_term(p->context);
+    zap_join(p->zap);
     free(p);
     return NULL;
 }
@@ -296,9 +427,11 @@ void publish_stop(struct publisher *p) {
     pthread_mutex_unlock(&p->lock);
     pthread_join(p->thread, NULL);
     zmq_ctx_term(p->context); // waits LINGER_MS at most for subscribers
+    zap_join(p->zap);
     pthread_cond_destroy(&p->work);
     pthread_cond_destroy(&p->done);
     pthread_mutex_destroy(&p->lock);
+    free(p->topics);
     free(p);
 }
 
@@ -366,6 +499,7 @@ void publish_close(struct outlet *o) {
         }
     if (p->turn == o)
         p->turn = NULL;
+    p->n_awaiting -= o->awaits;
     pthread_mutex_unlock(&p->lock);
     queue_free(first);
     free(o);

@@ -15,16 +15,25 @@
 struct publisher;
 struct outlet;
 
+// Since the daemon began; subscriptions: those that there are now.
+struct publish_counts {
+    uint64_t frames, frame_bytes, events, subscriptions;
+};
+
 // A frame being filled: header and arrays at `frame`, by the layout that frame_layout made.
 struct outlet_frame {
     struct journal_frame info;
     unsigned char *frame; // info.bytes bytes, 64-byte aligned
 };
 
-// Binds the socket and starts the thread. `endpoint` receives the address with the port that was
-// picked. NULL with a sentence in `why` (JOURNAL_WHY bytes).
-struct publisher *publish_start(const char *address, char *endpoint, size_t endpoint_bytes,
-                                char *why);
+#define PUBLISH_KEY 41 // bytes of a public key
+
+// Binds the socket and starts the thread; with a folder of keys (server/zap.h), encrypted.
+// `endpoint` receives the address with the port that was picked, `key` (PUBLISH_KEY bytes) the
+// public key or "". NULL with a sentence in `why` (JOURNAL_WHY bytes).
+struct publisher *publish_start(const char *address, const char *curve_dir, char *endpoint,
+                                size_t endpoint_bytes, char *key, char *why);
+void publish_count(struct publisher *publisher, struct publish_counts *out);
 // Writes and publishes what is queued, waits about a second for subscribers to take it, and ends.
 void publish_stop(struct publisher *publisher);
 
@@ -33,6 +42,12 @@ void publish_stop(struct publisher *publisher);
 struct outlet *publish_open(struct publisher *publisher, const char *run, struct journal *journal,
                             void (*wake)(void *context), void *context);
 void publish_close(struct outlet *outlet); // what is still queued is dropped
+
+// How many subscriptions there are that a frame of this run goes to. A subscriber that asks for
+// several topics which all match counts as often. They are looked at every half second, or, while
+// somebody awaits them, without delay.
+uint64_t publish_subscribers(struct outlet *outlet);
+void publish_await(struct outlet *outlet, bool awaits);
 
 // Drops what could not be written, of a run that is over.
 void publish_abandon(struct outlet *outlet);

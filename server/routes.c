@@ -27,6 +27,8 @@ const struct route routes_table[] = {
      "Object", JSON, NULL, NULL},
     {"GET", "/v1", routes_serve_service, -1, "Version, limits and endpoints", NULL, false, false,
      200, "Service", JSON, NULL, NULL},
+    {"GET", "/metrics", routes_serve_metrics, -1, "Counters and gauges for Prometheus", NULL, false,
+     false, 200, "Text", "text/plain", NULL, NULL},
     {"GET", "/v1/schemas/scene.json", routes_serve_schema, -1, "JSON Schema of a scene", NULL,
      false, false, 200, "Object", JSON, NULL, NULL},
     {"GET", "/v1/materials", routes_serve_materials, -1, "Material models with their parameters",
@@ -39,7 +41,10 @@ const struct route routes_table[] = {
      "Every fault of a scene, or its cost", "Validate", true, false, 200, "Valid", JSON, NULL,
      NULL},
     {"POST", "/v1/runs", routes_serve_create, -1, "Create a run", "Create", true, false, 201, "Run",
-     JSON, NULL, "409 503 507"},
+     JSON,
+     "header Idempotency-Key: 1 to 255 visible ASCII characters; the same key with the same body "
+     "creates one run, however often it is sent",
+     "409 503 507"},
     {"GET", "/v1/runs", routes_serve_runs, -1, "All runs, oldest first", NULL, false, false, 200,
      "Runs", JSON, NULL, NULL},
     {"GET", "/v1/runs/{id}", routes_serve_run, -1, "A run", NULL, false, false, 200, "Run", JSON,
@@ -58,13 +63,25 @@ const struct route routes_table[] = {
     {"GET", "/v1/runs/{id}/config", routes_serve_config, -1, "What may change while it runs", NULL,
      false, false, 200, "Config", JSON, NULL, NULL},
     {"PATCH", "/v1/runs/{id}/config", routes_serve_configure, RUN_DO_CONFIGURE,
-     "Change it, from the next step on", "Patch", true, true, 200, "Config", JSON, NULL,
+     "Change it, from the next step on", "Patch", true, true, 200, "Config", JSON,
+     "header If-Match: ETag of the configuration that is to be changed; 412 when it is another",
      "409 412 503 507"},
     {"GET", "/v1/runs/{id}/scene", routes_serve_run_scene, -1, "The scene as run", NULL, false,
      false, 200, "Scene", JSON, NULL, NULL},
     {"GET", "/v1/runs/{id}/probes", routes_serve_probes, -1, "Time series of all probes", NULL,
      false, false, 200, "Probes", JSON " text/csv", "since_step: only samples after this step",
      "400 503"},
+    {"GET", "/v1/runs/{id}/events", routes_serve_events, -1,
+     "Server-sent events: state, config, epoch, progress, end", NULL, false, false, 200, "Text",
+     "text/event-stream",
+     "header Last-Event-ID: replay what came after this event (0: all); without it, from the "
+     "present "
+     "state on",
+     "400 503"},
+    {"GET", "/v1/runs/{id}/stream", routes_serve_stream, -1,
+     "Frames as they come, back to back; the newest where the reader is behind", NULL, false, false,
+     200, "Frame", FRAME,
+     "max_particles: send every n-th particle, so that there are no more than this", "400 503"},
     {"GET", "/v1/runs/{id}/recorders", routes_serve_recorders, -1,
      "Who records the run, and how far", NULL, false, false, 200, "Recorders", JSON, NULL, NULL},
     {"PUT", "/v1/runs/{id}/recorders/{name}", routes_serve_record, -1,
@@ -80,6 +97,7 @@ const struct route routes_table[] = {
      "Frame", FRAME, NULL, "500"},
 };
 const size_t routes_count = sizeof routes_table / sizeof *routes_table;
+_Static_assert(sizeof routes_table / sizeof *routes_table <= ROUTES_MAX, "counted for /metrics");
 
 // ---- Routing ----------------------------------------------------------------------------------
 
@@ -192,20 +210,29 @@ static bool admit(void *context, struct http_request *request, struct http_reply
                       http_header(request, "Authorization"));
     if (status != 0) {
         reply_problem(reply, status, NULL, "%s", guard_detail(status));
-        return false;
+    } else if (route(&call)) {
+        if (atomic_load(&routes->open) || call.route->serve == routes_serve_health)
+            return true;
+        reply_problem(reply, 503, NULL, "the daemon is reading its earlier runs");
     }
-    if (!route(&call))
-        return false;
-    if (atomic_load(&routes->open) || call.route->serve == routes_serve_health)
-        return true;
-    reply_problem(reply, 503, NULL, "the daemon is reading its earlier runs");
+    routes_tally(routes, call.route, reply->status, 0);
+    log_line(LOG_LEVEL_DEBUG, "refused", "method=%s path=\"%.200s\" status=%d",
+             http_method(request), http_path(request), reply->status);
     return false;
 }
 
 static void too_large(void *context, struct http_reply *reply) {
-    const struct routes *routes = context;
+    struct routes *routes = context;
     reply_problem(reply, 413, NULL, "the body is over the limit of %zu bytes",
                   routes->options->max_body);
+    routes_tally(routes, NULL, reply->status, 0);
+}
+
+static void too_many(void *context, struct http_reply *reply) {
+    reply_problem(reply, 503, NULL,
+                  "there are %d connections already, or %d from your address, and all are busy",
+                  HTTP_CONNECTIONS, HTTP_CONNECTIONS_OF_ADDRESS);
+    routes_tally(context, NULL, reply->status, 0);
 }
 
 // Media type without its parameters.
@@ -250,13 +277,16 @@ static bool parse_body(struct call *c) {
 
 static void serve(void *context, struct http_request *request, struct http_reply *reply) {
     struct call call = {.routes = context, .request = request, .reply = reply};
+    double began = run_clock();
     if (!route(&call))
         return;
     if (parse_body(&call))
         call.route->serve(&call);
     cJSON_Delete(call.body);
-    log_line(LOG_LEVEL_DEBUG, "request", "method=%s path=\"%.200s\" status=%d",
-             http_method(request), http_path(request), reply->status);
+    double seconds = run_clock() - began;
+    routes_tally(context, call.route, reply->status, seconds);
+    log_line(LOG_LEVEL_DEBUG, "request", "method=%s path=\"%.200s\" status=%d ms=%.3f",
+             http_method(request), http_path(request), reply->status, 1e3 * seconds);
 }
 
 struct http_service routes_service(struct routes *routes) {
@@ -264,5 +294,6 @@ struct http_service routes_service(struct routes *routes) {
                                  .max_body = routes->options->max_body,
                                  .admit = admit,
                                  .serve = serve,
-                                 .too_large = too_large};
+                                 .too_large = too_large,
+                                 .too_many = too_many};
 }

@@ -8,13 +8,23 @@
 #include "server/options.h"
 #include "server/runs.h"
 
+#define ROUTES_MAX 48      // routes that are counted
+#define ROUTES_STATUSES 18 // statuses, the last for any other
+
 struct routes {
     const struct options *options;
     const struct run_host *host;
     struct runs *runs;
     struct guard guard;
     char http_url[320], publish_url[320];
-    atomic_bool open; // the runs of earlier daemons are listed; until then 503
+    char publish_key[PUBLISH_KEY]; // of the encrypted ZeroMQ socket, or ""
+    struct http_server *http;
+    atomic_int streams;                        // open
+    atomic_ullong stream_sent, stream_skipped; // frames
+    struct {
+        atomic_ullong replies[ROUTES_STATUSES], microseconds;
+    } tally[ROUTES_MAX + 1]; // by route; the last: what reached none
+    atomic_bool open;        // the runs of earlier daemons are listed; until then 503
 };
 
 // What http_start calls; `routes` must outlive the server.
@@ -35,7 +45,9 @@ struct route {
     int success;
     const char *response; // schema of the success, NULL = no body
     const char *type;     // its media types, space-separated
-    const char *query;    // "name: what it is", ... separated by newlines, or NULL
+    // "name: what it is" of the query, "header Name: what it is", ... separated by newlines, or
+    // NULL
+    const char *parameters;
     const char *problems; // statuses of its own, space-separated
 };
 extern const struct route routes_table[];

@@ -3,7 +3,8 @@
 #include "server/reply.h"
 #include "server/routes.h"
 
-#define ROUTES_SEGMENT 256 // bytes of one segment of a path
+#define ROUTES_SEGMENT 256     // bytes of one segment of a path
+#define ROUTES_STREAMS_MAX 128 // at a time, so that some connections are left for all else
 
 struct call {
     struct routes *routes;
@@ -19,10 +20,12 @@ void routes_serve_config(struct call *c);
 void routes_serve_configure(struct call *c);
 void routes_serve_create(struct call *c);
 void routes_serve_delete(struct call *c);
+void routes_serve_events(struct call *c);
 void routes_serve_frame(struct call *c);
 void routes_serve_frames(struct call *c);
 void routes_serve_health(struct call *c);
 void routes_serve_materials(struct call *c);
+void routes_serve_metrics(struct call *c);
 void routes_serve_openapi(struct call *c);
 void routes_serve_probes(struct call *c);
 void routes_serve_ready(struct call *c);
@@ -35,9 +38,13 @@ void routes_serve_scene(struct call *c);
 void routes_serve_scenes(struct call *c);
 void routes_serve_schema(struct call *c);
 void routes_serve_service(struct call *c);
+void routes_serve_stream(struct call *c);
 void routes_serve_unrecord(struct call *c);
 void routes_serve_validate(struct call *c);
 
+// Counts a reply for /metrics; `route` is NULL where there was none.
+void routes_tally(struct routes *routes, const struct route *route, int status, double seconds);
+double routes_progress(const struct run_status *status); // 0..1
 // The run that the path names, retained; NULL when the reply is a 404.
 struct run *routes_run_of(struct call *c);
 // The recorders of a run, [{name, acked, lag_frames, lag_bytes, heard_s}], new; and what its

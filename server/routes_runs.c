@@ -92,7 +92,7 @@ static cJSON *error_json(const struct run_error *error) {
     return json;
 }
 
-static double progress_of(const struct run_status *status) {
+double routes_progress(const struct run_status *status) {
     double span = status->end_time - status->start_time;
     double done = span > 0 ? (status->time - status->start_time) / span : 0;
     if (status->state == RUN_COMPLETED)
@@ -111,7 +111,7 @@ static cJSON *run_json(struct run *run) {
     reply_add(json, "start_time", status.start_time);
     reply_add(json, "end_time", status.end_time);
     reply_add(json, "stage", (double)status.stage);
-    reply_add(json, "progress", progress_of(&status));
+    reply_add(json, "progress", routes_progress(&status));
     reply_add(json, "eta_s", status.eta_s);
     reply_add(json, "dt", status.dt);
     reply_add(json, "dt_limit", status.dt_limit);
@@ -228,13 +228,38 @@ static void check_create(const cJSON *body, struct run_definition *out, struct f
     if (!cJSON_IsNumber(wait) || wait->valuedouble < 0 ||
         wait->valuedouble != floor(wait->valuedouble))
         routes_value_fault(faults, "wait_subscribers", "type", "a whole number, 0 or more", wait);
-    else if (wait->valuedouble != 0)
-        routes_value_fault(faults, "wait_subscribers", "unsupported",
-                           "0 (this version does not wait for subscribers)", wait);
+    else if (wait->valuedouble > RUN_SUBSCRIBERS_MAX)
+        routes_value_fault(faults, "wait_subscribers", "range", "at most 10000", wait);
+    else
+        out->wait_subscribers = (uint64_t)wait->valuedouble;
 }
 
-static void reply_created(struct call *c, struct run *run) {
+// The key of a request that may be sent twice, and a digest of its body. False when the reply is a
+// 400.
+static bool idempotency(struct call *c, struct run_definition *out, char *digest) {
+    const char *key = http_header(c->request, "Idempotency-Key");
+    if (key == NULL)
+        return true;
+    size_t n = 0;
+    while (key[n] > ' ' && key[n] < 127)
+        n++;
+    if (n == 0 || key[n] != '\0' || n > RUN_KEY_MAX) {
+        reply_problem(c->reply, 400, NULL,
+                      "Idempotency-Key must be 1 to %d visible ASCII characters", RUN_KEY_MAX);
+        return false;
+    }
+    char *text = json_print(c->body, false); // white space makes no other request
+    json_digest(text != NULL ? text : "", digest);
+    free(text);
+    out->key = key;
+    out->request = digest;
+    return true;
+}
+
+static void reply_created(struct call *c, struct run *run, bool again) {
     reply_json(c->reply, 201, run_json(run));
+    if (again)
+        http_reply_header(c->reply, "Idempotency-Replayed", "true");
     http_reply_header(c->reply, "Location", "/v1/runs/%s", run_id(run));
     run_release(run);
 }
@@ -244,7 +269,9 @@ void routes_serve_create(struct call *c) {
     struct run_definition definition = {0};
     struct mpm_estimate estimate;
     struct run *run = NULL, *twin = NULL;
-    char why[JOURNAL_WHY] = "";
+    char why[JOURNAL_WHY] = "", digest[JSON_DIGEST];
+    if (!idempotency(c, &definition, digest))
+        return;
     check_create(c->body, &definition, &faults);
     cJSON *merged = routes_merged_scene(c->body, &faults);
     struct scene *scene =
@@ -259,7 +286,15 @@ void routes_serve_create(struct call *c) {
     switch (runs_add(c->routes->runs, &definition, &run, why)) {
     case RUNS_CREATED:
         scene = NULL;
-        reply_created(c, run);
+        reply_created(c, run, false);
+        break;
+    case RUNS_THERE:
+        reply_created(c, run, true);
+        break;
+    case RUNS_KEY_REUSED:
+        faults_add(&faults, "", "idempotency_key", "the body that the key was first sent with",
+                   "another body", "%s", why);
+        reply_faults(c->reply, 422, &faults);
         break;
     case RUNS_DUPLICATE:
         twin = runs_find(c->routes->runs, definition.id);

@@ -28,27 +28,13 @@ void routes_serve_openapi(struct call *c) {
     reply_json(c->reply, 200, openapi_document());
 }
 
-static const char *instruction_set(void) {
-#if defined(__AVX512F__)
-    return "avx512";
-#elif defined(__AVX2__)
-    return "avx2";
-#elif defined(__x86_64__)
-    return "x86-64";
-#elif defined(__aarch64__)
-    return "aarch64";
-#else
-    return "generic";
-#endif
-}
-
 void routes_serve_service(struct call *c) {
     const struct options *options = c->routes->options;
     cJSON *json = cJSON_CreateObject(), *limits, *endpoints;
     cJSON_AddStringToObject(json, "name", "fbard");
     cJSON_AddStringToObject(json, "version", FBARD_VERSION);
     cJSON_AddStringToObject(json, "build", "C17, " __VERSION__);
-    cJSON_AddStringToObject(json, "instruction_set", instruction_set());
+    cJSON_AddStringToObject(json, "instruction_set", mpm_isa_name(mpm_isa_in_use(options->isa)));
     cJSON_AddNumberToObject(json, "threads", options->threads);
     cJSON_AddNumberToObject(json, "slots", options->slots);
     limits = cJSON_AddObjectToObject(json, "limits");
@@ -56,9 +42,14 @@ void routes_serve_service(struct call *c) {
     reply_add(limits, "memory_bytes", (double)options->memory_limit);
     reply_add(limits, "queue", options->queue);
     reply_add(limits, "json_depth", JSON_MAX_DEPTH);
+    reply_add(limits, "connections", HTTP_CONNECTIONS);
+    reply_add(limits, "connections_of_address", HTTP_CONNECTIONS_OF_ADDRESS);
+    reply_add(limits, "streams", ROUTES_STREAMS_MAX);
     endpoints = cJSON_AddObjectToObject(json, "endpoints");
     cJSON_AddStringToObject(endpoints, "http", c->routes->http_url);
     cJSON_AddStringToObject(endpoints, "publish", c->routes->publish_url);
+    if (c->routes->publish_key[0] != '\0')
+        cJSON_AddStringToObject(endpoints, "publish_key", c->routes->publish_key);
     reply_json(c->reply, 200, json);
 }
 

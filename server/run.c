@@ -103,6 +103,12 @@ const char *run_name(const struct run *r) {
 const char *run_created(const struct run *r) {
     return r->meta.created;
 }
+const char *run_key(const struct run *r) {
+    return r->meta.key;
+}
+const char *run_request(const struct run *r) {
+    return r->meta.request;
+}
 struct journal *run_journal(struct run *r) {
     return r->journal;
 }
@@ -157,7 +163,39 @@ static void wake(void *context) {
     pthread_mutex_lock(&r->lock);
     atomic_store(&r->knock, true);
     pthread_cond_signal(&r->wake);
+    r->news++;
+    pthread_cond_broadcast(&r->told);
     pthread_mutex_unlock(&r->lock);
+}
+
+void run_tell(struct run *r) {
+    pthread_mutex_lock(&r->lock);
+    r->news++;
+    pthread_cond_broadcast(&r->told);
+    pthread_mutex_unlock(&r->lock);
+}
+
+uint64_t run_news(struct run *r, uint64_t seen, double seconds) {
+    struct timespec until;
+    clock_gettime(CLOCK_MONOTONIC, &until);
+    double sum = 1e-9 * (double)until.tv_nsec + seconds;
+    until.tv_sec += (time_t)sum;
+    until.tv_nsec = (long)((sum - floor(sum)) * 1e9);
+    pthread_mutex_lock(&r->lock);
+    while (r->news == seen && !atomic_load(&r->stop))
+        if (pthread_cond_timedwait(&r->told, &r->lock, &until) != 0)
+            break;
+    uint64_t news = r->news;
+    pthread_mutex_unlock(&r->lock);
+    return news;
+}
+
+bool run_stopping(const struct run *r) {
+    return atomic_load(&r->stop);
+}
+
+void run_viewers(struct run *r, int change) {
+    atomic_fetch_add(&r->viewers, change);
 }
 
 void run_command(struct run *r, struct run_command *command) {
@@ -219,6 +257,7 @@ static struct run *run_new(const struct run_host *host, const char *id) {
     pthread_condattr_init(&attributes);
     pthread_condattr_setclock(&attributes, CLOCK_MONOTONIC);
     pthread_cond_init(&r->wake, &attributes);
+    pthread_cond_init(&r->told, &attributes);
     pthread_condattr_destroy(&attributes);
     pthread_cond_init(&r->done, NULL);
     pthread_mutex_init(&r->lock, NULL);
@@ -270,6 +309,7 @@ static void run_free(struct run *r) {
     pthread_mutex_destroy(&r->lock);
     pthread_cond_destroy(&r->wake);
     pthread_cond_destroy(&r->done);
+    pthread_cond_destroy(&r->told);
     free(r);
 }
 
@@ -287,6 +327,7 @@ static void describe_from_scene(struct run *r) {
     struct mpm_def *def = scene_def(r->scene);
     struct mpm_estimate estimate;
     def->n_threads = r->host->threads;
+    def->isa = r->host->isa;
     def->clock = run_clock;
     def->memory_limit = r->host->memory_limit;
     mpm_estimate(def, &estimate);
@@ -355,7 +396,13 @@ struct run *run_create(const struct run_host *host, const struct run_definition 
     if (r->scene_json == NULL || !meta_from_scene(r, definition->name))
         goto fail;
     r->now.state = definition->start ? RUN_QUEUED : RUN_PAUSED;
-    r->wants_sim = !definition->start;
+    r->meta.wait_subscribers = definition->wait_subscribers;
+    if (definition->key != NULL) {
+        snprintf(r->meta.key, sizeof r->meta.key, "%s", definition->key);
+        snprintf(r->meta.request, sizeof r->meta.request, "%s", definition->request);
+    }
+    r->lonely = definition->wait_subscribers > 0;
+    r->wants_sim = !definition->start && !r->lonely; // its first frame comes with the simulation
     run_describe(r);
     scene = json_print(r->scene_json, true);
     meta = history_meta_text(r->id, &r->meta);
@@ -547,6 +594,7 @@ static bool restore_live(struct run *r, enum run_restore how) {
                       false);
         return false;
     }
+    r->lonely = r->meta.wait_subscribers > 0 && journal_n_frames(r->journal) == 0;
     r->stop_step = r->history.stop_step;
     r->stop_time = r->history.stop_time;
     r->now.state = was != RUN_PAUSED && how == RUN_RESTORE_CONTINUE ? RUN_QUEUED : RUN_PAUSED;

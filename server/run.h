@@ -3,6 +3,7 @@
 // The run's thread is the only one that touches the simulation. Others post a command, which takes
 // effect between two steps, or read the status copy (docs/design.md).
 #pragma once
+#include <stdatomic.h>
 #include <stdbool.h>
 #include <stddef.h>
 #include <stdint.h>
@@ -18,6 +19,8 @@
 #define RUN_NAME_MAX 128
 #define RUN_QUEUE 32 // commands that may wait for the next step boundary
 #define RUN_WARNINGS 8
+#define RUN_KEY_MAX 255
+#define RUN_SUBSCRIBERS_MAX 10000
 
 #define RUN_STATE_LIST(X)                                                                          \
     X(QUEUED, "queued")                                                                            \
@@ -102,17 +105,26 @@ struct run_reference {
     char *source; // owned by the run
 };
 
+// What all runs have done since the daemon began.
+struct run_meters {
+    atomic_ullong steps, particle_steps;
+};
+
 // What a run needs of the daemon; outlives every run.
 struct run_host {
     const char *data_dir;
     struct publisher *publisher;
     struct slots *slots;
     int threads;
+    enum mpm_isa isa;
     size_t memory_limit;
+    struct run_meters *meters; // may be NULL
 };
 
 // The warnings that the scene alone calls for, of the F-bar, dt and dt_limit in `status`.
 void run_warn_scene(struct run_status *status, const struct mpm_def *def);
+
+double run_clock(void); // monotonic seconds
 
 struct run;
 
@@ -123,6 +135,9 @@ struct run_definition {
     bool start;
     const char *recorders[RECORDERS_MAX]; // registered before its first frame
     size_t n_recorders;
+    uint64_t wait_subscribers; // who must listen before its first frame is taken
+    const char *key;           // of an idempotent creation, or NULL
+    const char *request;       // with it: what the key stands for, at most 16 characters
 };
 // A new run with its folder and its thread. NULL with a sentence in `why`; then the scene is still
 // the caller's.
@@ -142,6 +157,8 @@ void run_release(struct run *run);
 const char *run_id(const struct run *run);
 const char *run_name(const struct run *run);
 const char *run_created(const struct run *run); // RFC 3339
+const char *run_key(const struct run *run);     // Idempotency-Key of its creation, or ""
+const char *run_request(const struct run *run); // and the digest of that request
 struct run_status run_status(struct run *run);
 char *run_scene_text(struct run *run);                      // JSON as run; the caller frees it
 char *run_config_text(struct run *run, uint64_t *revision); // the settable part of it
@@ -149,6 +166,12 @@ cJSON *run_changes(struct run *run);              // [{step, time, patch}] of th
 struct series *run_series(struct run *run);       // NULL before there are probes
 struct journal *run_journal(struct run *run);     // NULL when its folder is damaged
 struct recorders *run_recorders(struct run *run); // likewise
+// Waits until something has happened to the run since `seen` was returned (an event, a frame, a
+// change of state), at most `seconds`; what to pass the next time.
+uint64_t run_news(struct run *run, uint64_t seen, double seconds);
+bool run_stopping(const struct run *run); // the daemon ends
+// A viewer over HTTP, who counts among those that a run waits for.
+void run_viewers(struct run *run, int change);
 void run_nudge(struct run *run); // a recorder has acknowledged frames or is gone: there may be room
 const struct run_reference *run_references(const struct run *run, size_t *count);
 

@@ -7,6 +7,8 @@
 #include "server/log.h"
 #include "server/run_inside.h"
 
+#define STEPS_MAX 1e15 // as of a new run: beyond it doubles soon no longer count one by one
+
 // ---- Changes of the configuration -------------------------------------------------------------
 
 static bool change_apply(struct run *r, const struct scene_config *next, unsigned which,
@@ -21,6 +23,15 @@ static bool change_apply(struct run *r, const struct scene_config *next, unsigne
         faults_add(faults, "/time/end", "range", expected, actual,
                    "must not lie before the present time %.9g s, got %.9g s", mpm_time(r->sim),
                    next->end);
+        return false;
+    }
+    double dt = next->settings.dt > 0 ? next->settings.dt : mpm_next_dt(r->sim);
+    if ((next->end - mpm_time(r->sim)) / dt > STEPS_MAX) {
+        char actual[64];
+        snprintf(actual, sizeof actual, "%.3g steps", (next->end - mpm_time(r->sim)) / dt);
+        faults_add(faults, end_changed ? "/time/end" : "/time", "range", "at most 1e15 steps",
+                   actual, "from now to %.9g s would take more than 1e15 steps of %.6g s",
+                   next->end, dt);
         return false;
     }
     if (which != 0)

@@ -32,6 +32,8 @@ struct run {
     pthread_mutex_t lock;
     pthread_cond_t wake; // of the run's thread
     pthread_cond_t done; // a command was answered
+    pthread_cond_t told; // something has happened that others may want to know
+    uint64_t news;       // how much
     struct run_command *queue;
     unsigned n_queued;
     bool accepts;             // commands are still being answered
@@ -40,8 +42,9 @@ struct run {
     cJSON *changes;        // of the configuration, as the API tells them
     struct series *series; // set once
 
-    atomic_bool knock; // look at the queue, the slot or the outlet
-    atomic_bool stop;  // the daemon ends
+    atomic_bool knock;  // look at the queue, the slot or the outlet
+    atomic_bool stop;   // the daemon ends
+    atomic_int viewers; // over HTTP
 
     // The thread's own.
     struct run_status now; // what `status` is copied from
@@ -53,8 +56,10 @@ struct run {
     double *row;      // (columns) scratch for a sample
     struct history history;
     struct replay replay;
-    bool wants_sim; // a new run that is paused: so that its first frame is there
-    bool due;       // a frame has to be taken at this step
+    bool wants_sim;   // a new run that is paused: so that its first frame is there
+    bool due;         // a frame has to be taken at this step
+    bool lonely;      // waits for subscribers before its first frame
+    uint64_t metered; // steps that the daemon's meters have counted
     uint64_t next_seq;
     uint64_t stop_step; // of :step
     double stop_time;
@@ -75,7 +80,7 @@ struct run {
 enum run_verdict { RUN_REFUSED, RUN_ACTS, RUN_ALREADY };
 enum run_verdict run_verdict(enum run_action action, enum run_state state);
 
-double run_clock(void); // monotonic seconds
+void run_tell(struct run *run); // wakes who waits for news
 // ---- run_loop.c
 void *run_thread(void *run);
 // Takes the frames and makes the changes that belong to this step, in the order in which they were

@@ -15,6 +15,8 @@
 #include "server/run_inside.h"
 
 #define WARNING_ROOM "waits for room "
+#define WARNING_LONELY "waits for subscribers: "
+#define LONELY_SECONDS 0.02  // between two looks whether somebody has come
 #define PUBLISH_SECONDS 0.02 // between two copies of the status
 #define WAITING_SECONDS 0.25 // a shorter wait for the disk is not worth a change of state
 #define CHECKPOINT_FLUSH 5.0 // s to wait for frames on their way before a checkpoint is given up
@@ -94,11 +96,23 @@ static void go(struct run *r) {
     size_t needs = r->sim == NULL && r->slot.reserved == 0 ? r->sim_bytes : 0;
     if (!slots_ask(r->host->slots, &r->slot, needs))
         run_state_enter(r, RUN_QUEUED);
+    else if (r->lonely)
+        run_state_enter(r, RUN_WAITING); // for now: the loop looks who is there
     else if (run_sim_begin(r))
         run_state_enter(r, RUN_RUNNING);
 }
 
+// Who asks for a step or a frame now does not wait for others to come.
+static void stop_waiting_for_others(struct run *r) {
+    if (r->lonely) {
+        r->lonely = false;
+        publish_await(r->outlet, false);
+        run_unwarn(&r->now, WARNING_LONELY);
+    }
+}
+
 static enum run_outcome step_run(struct run *r, struct run_command *c) {
+    stop_waiting_for_others(r);
     if (!run_sim_begin_idle(r)) {
         snprintf(c->why, sizeof c->why, "no memory for the simulation now");
         return RUN_BUSY;
@@ -121,6 +135,7 @@ static enum run_outcome step_run(struct run *r, struct run_command *c) {
 
 static enum run_outcome snapshot(struct run *r, struct run_command *c) {
     struct journal_frame last;
+    stop_waiting_for_others(r);
     if (!run_sim_begin_idle(r)) {
         snprintf(c->why, sizeof c->why, "no memory for the simulation now");
         return RUN_BUSY;
@@ -159,6 +174,8 @@ static enum run_outcome act(struct run *r, struct run_command *c) {
         run_end_with(r, RUN_CANCELLED);
         return RUN_DONE;
     case RUN_DO_CHECKPOINT:
+        if (r->lonely)
+            return RUN_DONE; // nothing has happened that would have to be kept
         if (!run_sim_begin_idle(r)) {
             snprintf(c->why, sizeof c->why, "no memory for the simulation now");
             return RUN_BUSY;
@@ -167,7 +184,7 @@ static enum run_outcome act(struct run *r, struct run_command *c) {
     case RUN_DO_SNAPSHOT:
         return snapshot(r, c);
     case RUN_DO_CONFIGURE:
-        if (r->now.state != RUN_QUEUED && !run_sim_begin_idle(r)) {
+        if (r->now.state != RUN_QUEUED && !r->lonely && !run_sim_begin_idle(r)) {
             snprintf(c->why, sizeof c->why, "no memory for the simulation now");
             return RUN_BUSY;
         }
@@ -302,6 +319,11 @@ static void finish(struct run *r) {
         return;
     if (!r->end_pushed)
         r->end_pushed = end_push(r);
+    // The frames on their way may fail after the last one was pushed behind them.
+    enum journal_result status = publish_status(r->outlet, why);
+    if (r->end_pushed && r->ending == RUN_COMPLETED &&
+        (status == JOURNAL_ERROR || (status == JOURNAL_FULL && !r->config.output.when_full_block)))
+        run_fail(r, "journal", "look at the disk of the data folder", why);
     bool forced = r->ending != RUN_COMPLETED && !journal_works(r);
     if (!r->end_pushed || (!publish_flush(r->outlet, 0) && !forced))
         return;
@@ -425,6 +447,38 @@ static void advance(struct run *r) {
         run_checkpoint(r, why);
 }
 
+// Whether the run still waits for those who are to see its first frame. What it has of memory it
+// keeps meanwhile, and its slot.
+static bool is_lonely(struct run *r) {
+    if (!r->lonely)
+        return false;
+    uint64_t there = publish_subscribers(r->outlet) + (uint64_t)atomic_load(&r->viewers);
+    r->lonely = there < r->meta.wait_subscribers;
+    run_unwarn(&r->now, WARNING_LONELY);
+    if (r->lonely)
+        run_warn(&r->now, WARNING_LONELY "%llu of %llu listen to run/%s/frame",
+                 (unsigned long long)there, (unsigned long long)r->meta.wait_subscribers, r->id);
+    publish_await(r->outlet, r->lonely);
+    return r->lonely;
+}
+
+static void wait_for_subscribers(struct run *r) {
+    run_wall_wait(r);
+    if (r->now.state != RUN_WAITING)
+        run_state_enter(r, RUN_WAITING);
+    else if (run_clock() - r->last_published > PUBLISH_SECONDS)
+        run_status_publish(r, false);
+    wait_for_knock(r, LONELY_SECONDS);
+}
+
+// Makes the simulation where there is none yet, and runs.
+static void begin_running(struct run *r) {
+    if (is_lonely(r))
+        wait_for_subscribers(r);
+    else if (run_sim_begin(r))
+        run_state_enter(r, RUN_RUNNING);
+}
+
 // One turn of the loop in the present state.
 static void turn(struct run *r) {
     if (r->ending != RUN_N_STATES) {
@@ -440,14 +494,19 @@ static void turn(struct run *r) {
     switch (r->now.state) {
     case RUN_QUEUED:
         if (slots_granted(r->host->slots, &r->slot)) {
-            if (run_sim_begin(r))
-                run_state_enter(r, RUN_RUNNING);
+            begin_running(r);
         } else {
             wait_for_knock(r, 60);
         }
         break;
-    case RUN_RUNNING:
     case RUN_WAITING:
+        if (r->lonely) {
+            begin_running(r);
+            break;
+        }
+        advance(r);
+        break;
+    case RUN_RUNNING:
         advance(r);
         break;
     case RUN_PAUSED:

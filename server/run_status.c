@@ -114,6 +114,12 @@ void run_status_fill(struct run *r, bool exact) {
         r->now.start_time = mpm_start_time(r->sim) + 0.0;
         r->now.end_time = mpm_end_time(r->sim);
         r->now.particles = mpm_n_particles(r->sim);
+        if (r->host->meters != NULL && r->now.step > r->metered) {
+            atomic_fetch_add(&r->host->meters->steps, r->now.step - r->metered);
+            atomic_fetch_add(&r->host->meters->particle_steps,
+                             (r->now.step - r->metered) * r->now.particles);
+        }
+        r->metered = r->now.step;
         r->now.nodes = mpm_n_nodes(r->sim);
         r->now.bytes = mpm_bytes(r->sim);
         r->now.fbar_scheme = settings.fbar.scheme;
@@ -178,6 +184,7 @@ enum journal_result run_event_log(struct run *r, cJSON *event, char *why) {
     if (result == JOURNAL_OK) {
         publish_event(r->outlet, text);
         remember_change(r, event);
+        run_tell(r);
     } else {
         log_error("event_log", "run=%s why=\"%s\"", r->id, why);
     }
@@ -211,6 +218,7 @@ void run_state_enter(struct run *r, enum run_state state) {
     if (run_event_log(r, event, why) != JOURNAL_OK)
         run_warn(&r->now, "the event log cannot be written: %.150s", why);
     run_status_publish(r, true);
+    run_tell(r);
     log_info("state", "run=%s state=%s before=%s step=%llu time=%.9g", r->id, run_state_name(state),
              run_state_name(before), (unsigned long long)r->now.step, r->now.time);
 }

@@ -179,6 +179,14 @@ static enum runs_result admission(const struct runs *s, const char *id, char *wh
     return RUNS_CREATED;
 }
 
+// Under the lock: a run that the same key has made already.
+static struct run *made_with_key(const struct runs *s, const char *key) {
+    for (size_t k = 0; key != NULL && k < s->count; k++)
+        if (strcmp(run_key(s->items[k]), key) == 0)
+            return s->items[k];
+    return NULL;
+}
+
 enum runs_result runs_add(struct runs *s, const struct run_definition *definition, struct run **out,
                           char *why) {
     char id[RUN_ID_MAX + 1];
@@ -190,7 +198,19 @@ enum runs_result runs_add(struct runs *s, const struct run_definition *definitio
     else
         snprintf(id, sizeof id, "%s", definition->id);
     named.id = id;
-    enum runs_result result = admission(s, id, why);
+    enum runs_result result;
+    struct run *earlier = made_with_key(s, definition->key);
+    if (earlier == NULL) {
+        result = admission(s, id, why);
+    } else if (strcmp(run_request(earlier), definition->request) == 0) {
+        result = RUNS_THERE;
+        *out = earlier;
+        run_retain(earlier);
+    } else {
+        result = RUNS_KEY_REUSED;
+        snprintf(why, JOURNAL_WHY, "the key was used already, with another body, for run %s",
+                 run_id(earlier));
+    }
     pthread_mutex_unlock(&s->lock);
     if (result == RUNS_CREATED) {
         *out = run_create(s->host, &named, why);

@@ -13,9 +13,18 @@ void runs_free(struct runs *runs); // after runs_stop
 
 bool runs_id_valid(const char *id); // [A-Za-z0-9][A-Za-z0-9._-]{0,63}
 
-enum runs_result { RUNS_CREATED, RUNS_DUPLICATE, RUNS_FULL, RUNS_STORAGE, RUNS_STOPPED };
-// On RUNS_CREATED `out` is retained for the caller and the scene is the run's; else the scene stays
-// the caller's and `why` (JOURNAL_WHY bytes) says why. An id of NULL has one made from the name.
+enum runs_result {
+    RUNS_CREATED,
+    RUNS_THERE,      // created before by the same request of the same key: `out` is that run
+    RUNS_KEY_REUSED, // the key was used for another request
+    RUNS_DUPLICATE,
+    RUNS_FULL,
+    RUNS_STORAGE,
+    RUNS_STOPPED,
+};
+// On RUNS_CREATED and RUNS_THERE `out` is retained for the caller; on RUNS_CREATED the scene is the
+// run's; else the scene stays the caller's and `why` (JOURNAL_WHY bytes) says why. An id of NULL
+// has one made from the name.
 enum runs_result runs_add(struct runs *runs, const struct run_definition *definition,
                           struct run **out, char *why);
 struct run *runs_find(struct runs *runs, const char *id); // retained; NULL when there is none

@@ -31,7 +31,7 @@ for hit in $(grep -rlE '#include "server/mpm/' server --include='*.[ch]' | grep 
         breach "$hit includes the solver's inside"
 done
 only 'microhttpd.h' 'server/http\.[ch]' 'only http.c knows libmicrohttpd'
-only 'zmq.h' '(server/publish|client/subscribe)\.c' 'only the two ends of the socket know ZeroMQ'
+only 'zmq.h' '(server/(publish|zap)|client/subscribe)\.c' 'only the two ends of the socket, and who admits to it, know ZeroMQ'
 only 'hdf5.h' 'client/store(_read)?\.c' 'only store.c and store_read.c know HDF5'
 only 'curl/' 'client/request\.c' 'only request.c knows libcurl'
 for hit in $(grep -rnE '\b(printf|fprintf|fopen|getenv|exit|clock_gettime|time)\(' server/mpm --include='*.c' |

@@ -286,16 +286,57 @@ def test_subscriber_that_comes_late_repairs_its_gap_over_http(daemon, name):
 
 
 def test_wait_subscribers_holds_the_run_until_somebody_listens(daemon, name):
-    reply = daemon.request("POST", "/v1/runs", {"scene": water(), "id": name, "wait_subscribers": 1})
-    if reply.status == 422 and reply.pointers == ["/wait_subscribers"]:
-        pytest.skip("not in this version: " + reply.json["detail"])
-    assert reply.status == 201, reply
+    daemon.create(water(), id=name, wait_subscribers=1)
     assert daemon.wait(name, "waiting")["step"] == 0
+    assert daemon.frames(name) == [], "its first frame is for those it waits for"
     with Subscriber(daemon, f"run/{name}/frame") as subscriber:
         seqs = [Frame(m[1]).header["seq"] for m in subscriber.until_end()]
     assert seqs[0] == 0, "who was waited for misses nothing at first"
     daemon.wait(name, "completed")
     daemon.away(name)
+
+
+def test_wait_subscribers_counts_those_of_this_run(daemon, name):
+    daemon.create(water(), id=name, wait_subscribers=2)
+    with Subscriber(daemon, f"run/{name}x/frame"), Subscriber(daemon, f"run/{name}/event"):
+        with Subscriber(daemon, f"run/{name}/"):
+            warned = until(lambda: (w := daemon.run(name)["warnings"]) and "1 of 2" in w[0] and w)
+            assert name in warned[0]
+            time.sleep(0.3)
+            assert daemon.run(name)["state"] == "waiting"
+            with Subscriber(daemon, b"") as last:
+                assert Frame([m for m in last.until_end() if m[0] == f"run/{name}/frame".encode()][0][1])
+    now = daemon.wait(name, "completed")
+    assert now["warnings"] == [] and now["step"] == WATER_STEPS
+    daemon.away(name)
+
+
+def test_wait_subscribers_survives_pauses_changes_and_restarts(fresh, name):
+    d = fresh()
+    d.start()
+    d.create(water(), id=name, wait_subscribers=1)
+    d.wait(name, "waiting")
+    assert d.act(name, "pause")["state"] == "paused"
+    d.patch(name, {"fbar": False})
+    d.act(name, "resume")
+    d.wait(name, "waiting")
+    d.kill()
+    d.start()
+    assert d.wait(name, "waiting")["step"] == 0
+    with Subscriber(d, f"run/{name}/frame") as subscriber:
+        frames = [Frame(m[1]) for m in subscriber.until_end()]
+    assert frames[0].header["seq"] == 0 and frames[0].header["fbar"] is False
+    d.wait(name, "completed")
+
+
+def test_step_and_cancel_do_not_wait_for_subscribers(daemon, name):
+    daemon.create(water(), id=name, wait_subscribers=5, start=False)
+    daemon.act(name, "step", {"steps": 3})
+    assert daemon.wait(name, "paused")["step"] == 3
+    daemon.create(water(), id=name + "x", wait_subscribers=5)
+    daemon.wait(name + "x", "waiting")
+    assert daemon.act(name + "x", "cancel")["state"] == "cancelled"
+    daemon.away(name, name + "x")
 
 
 FAT = merged(big(16), {"time": {"end": 0.008}, "output": {"interval": 2e-4, "probe_interval": 1,

@@ -531,7 +531,7 @@ def test_two_runs_of_one_id_at_the_same_moment_are_one_201_and_the_rest_409(daem
     "more, pointer, actual",
     [
         ({"id": "a/b"}, "/id", '"a/b"'), ({"id": ""}, "/id", '""'), ({"id": "x" * 65}, "/id", "x" * 65),
-        ({"wait_subscribers": 3}, "/wait_subscribers", "3"), ({"wait_subscribers": 1.5}, "/wait_subscribers", "1.5"),
+        ({"wait_subscribers": 10001}, "/wait_subscribers", "10001"), ({"wait_subscribers": 1.5}, "/wait_subscribers", "1.5"),
         ({"overrides": {"loads": {"a": 1}}}, "/scene/loads/a", "1"), ({"idd": "a"}, "/idd", "idd"),
     ],
 )  # fmt: skip

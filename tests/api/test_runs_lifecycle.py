@@ -522,3 +522,57 @@ def test_runs_that_come_and_go_leave_nothing_behind(daemon):
     until(lambda: daemon.n_threads() <= threads + 1 and daemon.descriptors() <= descriptors + 3)
     known = {r["id"] for r in daemon.get("/v1/runs")["runs"]}
     assert {p.name for p in (daemon.data / "runs").iterdir()} == known
+
+
+# ---- Creation that may be sent twice ----
+
+
+def keyed(daemon, key, body, status=201):
+    return daemon.ask("POST", "/v1/runs", body, {"Idempotency-Key": key}, status=status)
+
+
+def test_creation_with_a_key_makes_one_run(daemon, name):
+    body = {"scene": water(), "start": False}
+    first = keyed(daemon, name, body)
+    assert "idempotency-replayed" not in first.headers
+    run = first.json["id"]
+    daemon.act(run, "step", {"steps": 3})
+    daemon.wait(run, "paused")
+    again = keyed(daemon, name, body)
+    assert again.headers["idempotency-replayed"] == "true"
+    assert again.headers["location"] == first.headers["location"] == f"/v1/runs/{run}"
+    assert (again.json["id"], again.json["step"]) == (run, 3), "the run as it is now"
+    assert [r["id"] for r in daemon.get("/v1/runs")["runs"]].count(run) == 1
+    fault = keyed(daemon, name, {**body, "start": True}, 422).fault("")
+    assert fault["code"] == "idempotency_key" and run in fault["detail"]
+    assert keyed(daemon, name + "x", {**body, "id": run}, 409), "another key does not excuse a taken id"
+    daemon.away(run)
+    other = keyed(daemon, name, body).json["id"]
+    daemon.away(other)
+
+
+def test_creation_with_a_key_is_remembered_over_kill_9(fresh, name):
+    d = fresh()
+    d.start()
+    body = {"scene": water(), "id": name, "start": False}
+    keyed(d, "once", body)
+    d.kill()
+    d.start()
+    assert keyed(d, "once", body).headers["idempotency-replayed"] == "true"
+    d.ask("POST", "/v1/runs", body, status=409)
+    keyed(d, "once", {**body, "id": name + "x"}, 422)
+
+
+def test_creation_with_a_key_by_many_at_once(daemon, name):
+    import concurrent.futures
+
+    with concurrent.futures.ThreadPoolExecutor(8) as pool:
+        runs = list(pool.map(lambda _: keyed(daemon, name, {"scene": water(), "start": False}).json["id"], range(8)))
+    assert len(set(runs)) == 1
+    daemon.away(runs[0])
+
+
+@pytest.mark.parametrize("bad", ["", "a b", "é", "x" * 256])
+def test_creation_with_a_bad_key_is_refused(daemon, bad):
+    reply = daemon.ask("POST", "/v1/runs", {"scene": water()}, {"Idempotency-Key": bad.encode()}, status=400)
+    assert "Idempotency-Key" in reply.json["detail"]

@@ -1,56 +1,87 @@
-"""The same bits for any number of threads, paused or not, looked at or not: the paper's scenes, by their frames."""
-import json
+"""16 clients, 8 subscribers and patches at once: what `make check-tsan` runs under ThreadSanitizer."""
+import concurrent.futures
 import os
+import random
+import time
 
-import pytest
-from boxes import merged
-from fbard import ROOT, Daemon
+import zmq
+from boxes import endless, water
+from fbard import until
 from frames import Frame
+from test_watching import Stream
 
-STEPS = 60
-SCENES = {
-    "dam-break": {},
-    "cook-membrane": {},
-    "strip-footing-small": {},
-    "landslide-slice": {},
-}
+SECONDS = 20 if os.environ.get("FBARD_LONG") else 3
 
 
-def frames(folder, scene, threads, disturbed):
-    daemon = Daemon(folder, threads=threads).start()
+def zeromq(daemon, end):
+    """Frames that came, each whole."""
+    context, count = zmq.Context(), 0
     try:
-        daemon.create(scene, id="run", start=False)
-        parts = [20, 5, 35] if disturbed else [STEPS]
-        for steps in parts:
-            daemon.act("run", "step", {"steps": steps})
-            daemon.wait("run", "paused")
-            if disturbed:  # looks change nothing
-                daemon.act("run", "snapshot")
-                daemon.run("run")
-        assert daemon.run("run")["step"] == STEPS
-        last = Frame(daemon.frame("run", daemon.act("run", "snapshot")["frame_seq"]))
-        return {name: array.tobytes() for name, array in last.fields.items()}, daemon.run("run")["balance"]
+        s = context.socket(zmq.SUB)
+        s.subscribe(b"run/")
+        s.connect(daemon.publish)
+        while time.monotonic() < end:
+            if s.poll(100):
+                topic, block = s.recv_multipart()
+                count += topic.endswith(b"/frame") and Frame(block).header["seq"] >= 0
     finally:
-        daemon.stop()
+        context.destroy(linger=0)
+    return count
 
 
-def scene_of(name, overrides):
-    scene = json.loads((ROOT / "scenes" / f"{name}.json").read_text())
-    fields = ["position", "velocity", "stress", "volume_ratio", "volume_ratio_bar"]
-    return merged(merged(scene, {"output": {"interval": 1e9, "fields": fields}}), overrides)
+def streamed(daemon, run, kind, end):
+    count = 0
+    with Stream(daemon, f"/v1/runs/{run}/{kind}") as stream:
+        for _ in stream.frames() if kind == "stream" else stream.events():
+            count += 1
+            if time.monotonic() > end:
+                return count
+    return count
 
 
-@pytest.mark.parametrize("name", sorted(SCENES))
-def test_frames_do_not_depend_on_threads(tmp_path, name):
-    scene = scene_of(name, SCENES[name])
-    first = frames(tmp_path / "1", scene, 1, False)
-    for threads in [2, 3, 4, 7] if os.environ.get("FBARD_LONG") else [2, 7]:
-        assert frames(tmp_path / str(threads), scene, threads, threads % 2 == 1) == first, threads
+def client(daemon, runs, seed, end):
+    random_, asked = random.Random(seed), 0
+    while time.monotonic() < end:
+        run, what = random_.choice(runs), random_.randrange(12)
+        if what < 3:
+            reply = daemon.request("GET", f"/v1/runs/{run}" + random_.choice(["", "/config", "/probes", "/frames/latest"]))
+        elif what < 6:
+            patch = random_.choice([{"fbar": True}, {"fbar": False}, {"damping": {"mass": random_.random()}},
+                                    {"time": {"dt": 5e-4 + 5e-4 * random_.random()}}])  # fmt: skip
+            reply = daemon.request("PATCH", f"/v1/runs/{run}/config", patch)
+        elif what < 8:
+            reply = daemon.request("POST", f"/v1/runs/{run}:" + random_.choice(["pause", "resume", "snapshot", "checkpoint"]))
+        elif what < 9:
+            reply = daemon.request("PUT", f"/v1/runs/{run}/recorders/c{seed}", {"acked": -1})
+            daemon.request("DELETE", f"/v1/runs/{run}/recorders/c{seed}")
+        elif what < 10:
+            reply = daemon.request("GET", random_.choice(["/metrics", "/v1/runs", "/v1"]))
+        else:
+            own = f"c{seed}x{asked}"
+            reply = daemon.request("POST", "/v1/runs", {"scene": water(time={"end": 0.01}), "id": own})
+            if reply.status == 201:
+                daemon.away(own)
+        assert reply.status in (200, 201, 409, 503), reply
+        asked += 1
+    return asked
 
 
-@pytest.mark.skipif(not os.environ.get("FBARD_LONG"), reason="long: needs FBARD_LONG=1")
-def test_frames_of_the_whole_landslide_do_not_depend_on_threads(tmp_path):
-    scene = scene_of("landslide", {})
-    first = frames(tmp_path / "1", scene, 1, False)
-    for threads in (2, 7):
-        assert frames(tmp_path / str(threads), scene, threads, threads == 7) == first, threads
+def test_many_clients_subscribers_and_patches_at_once(fresh):
+    d = fresh("--queue", "40", slots=3)
+    d.start()
+    scene = endless(output={"interval": 0.02, "probe_interval": 0.02, "journal_bytes": 1 << 20})
+    runs = [d.create(scene)["id"] for _ in range(3)]
+    end = time.monotonic() + SECONDS
+    with concurrent.futures.ThreadPoolExecutor(24) as pool:
+        listeners = [pool.submit(zeromq, d, end) for _ in range(4)]
+        listeners += [pool.submit(streamed, d, runs[0], kind, end) for kind in ("events", "stream") * 2]
+        clients = [pool.submit(client, d, runs, seed, end) for seed in range(16)]
+        time.sleep(max(0.0, end - time.monotonic()))
+        for run in runs:
+            until(lambda: d.request("POST", f"/v1/runs/{run}:resume").status == 200)
+        asked = sum(c.result() for c in clients)
+        for run in runs:
+            d.request("POST", f"/v1/runs/{run}:cancel")
+        assert all(listener.result() > 0 for listener in listeners)
+    assert asked > 16
+    d.stop()  # and looks for what a sanitizer wrote

@@ -55,7 +55,7 @@ static void test_options_nonsense_is_refused(void **state) {
         {"--http", "::1:80"},     {"--http", ":80"},       {"--publish", "udp://127.0.0.1:1"},
         {"--publish", "tcp://x"}, {"--slots", "0"},        {"--slots", "2x"},
         {"--threads", "-1"},      {"--resume", "perhaps"}, {"--memory-limit", "much"},
-        {"--max-body", "0"},      {"--data-dir", ""},      {"--curve-dir", "/tmp"},
+        {"--max-body", "0"},      {"--data-dir", ""},      {"--curve-dir", ""},
         {"--tls-cert", "/tmp/c"}, {"--insecure=1", "x"},   {"--port-file", ""},
     };
     for (size_t k = 0; k < sizeof bad / sizeof *bad; k++) {
@@ -76,6 +76,9 @@ static void test_options_beyond_loopback_needs_a_guard(void **state) {
     assert_int_equal(PARSE("--data-dir", "/tmp/x", "--http", "0.0.0.0:0", "--insecure"),
                      OPTIONS_RUN);
     assert_int_equal(PARSE("--data-dir", "/tmp/x", "--publish", "tcp://0.0.0.0:0"), OPTIONS_BAD);
+    assert_int_equal(
+        PARSE("--data-dir", "/tmp/x", "--publish", "tcp://0.0.0.0:0", "--curve-dir", "/k"),
+        OPTIONS_RUN);
 }
 
 static void test_options_default_folder_follows_xdg(void **state) {
@@ -87,6 +90,25 @@ static void test_options_default_folder_follows_xdg(void **state) {
     setenv("HOME", "/home/me", 1);
     assert_int_equal(PARSE("--slots", "1"), OPTIONS_RUN);
     assert_string_equal(options.data_dir, "/home/me/.local/state/fbard");
+}
+
+static void test_options_isa_comes_from_the_environment(void **state) {
+    (void)state;
+    setenv("FBARD_ISA", "baseline", 1);
+    assert_int_equal(PARSE("--data-dir", "/tmp/x"), OPTIONS_RUN);
+    assert_int_equal(options.isa, MPM_ISA_BASELINE);
+    setenv("FBARD_ISA", "sse9", 1);
+    assert_int_equal(PARSE("--data-dir", "/tmp/x"), OPTIONS_BAD);
+    assert_non_null(strstr(message, "FBARD_ISA: must be one of auto baseline"));
+    assert_non_null(strstr(message, "'sse9'"));
+    for (int k = 0; k < MPM_N_ISAS; k++) {
+        bool there = mpm_isa_available((enum mpm_isa)k);
+        setenv("FBARD_ISA", mpm_isa_name((enum mpm_isa)k), 1);
+        assert_int_equal(PARSE("--data-dir", "/tmp/x"), there ? OPTIONS_RUN : OPTIONS_BAD);
+    }
+    unsetenv("FBARD_ISA");
+    assert_int_equal(PARSE("--data-dir", "/tmp/x"), OPTIONS_RUN);
+    assert_int_equal(options.isa, MPM_ISA_AUTO);
 }
 
 static void test_options_bytes_know_suffixes(void **state) {
@@ -139,6 +161,7 @@ int main(int argc, char **argv) {
         cmocka_unit_test(test_options_nonsense_is_refused),
         cmocka_unit_test(test_options_beyond_loopback_needs_a_guard),
         cmocka_unit_test(test_options_default_folder_follows_xdg),
+        cmocka_unit_test(test_options_isa_comes_from_the_environment),
         cmocka_unit_test(test_options_bytes_know_suffixes),
         cmocka_unit_test(test_options_help_names_every_option),
         cmocka_unit_test(test_guard_refuses_foreign_hosts_and_origins),

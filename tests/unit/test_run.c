@@ -26,7 +26,7 @@ static const char overrides[] =
     "\"output\":{\"interval\":0.01}}";
 
 static int open_host(void **state) {
-    char endpoint[256];
+    char endpoint[256], key[PUBLISH_KEY];
     (void)state;
     log_threshold(LOG_LEVEL_ERROR);
     snprintf(folder, sizeof folder, "/tmp/fbard-test-XXXXXX");
@@ -36,12 +36,12 @@ static int open_host(void **state) {
     if (lock < 0)
         return -1;
     close(lock);
-    host = (struct run_host){.data_dir = folder,
-                             .publisher =
-                                 publish_start("tcp://127.0.0.1:*", endpoint, sizeof endpoint, why),
-                             .slots = slots_create(1, (size_t)1 << 30),
-                             .threads = 1,
-                             .memory_limit = (size_t)1 << 30};
+    host = (struct run_host){
+        .data_dir = folder,
+        .publisher = publish_start("tcp://127.0.0.1:*", NULL, endpoint, sizeof endpoint, key, why),
+        .slots = slots_create(1, (size_t)1 << 30),
+        .threads = 1,
+        .memory_limit = (size_t)1 << 30};
     return host.publisher != NULL && host.slots != NULL ? 0 : -1;
 }
 

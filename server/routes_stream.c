@@ -1,0 +1,390 @@
+// Routes without an end: events as they happen (server-sent events), frames as they come. Each has
+// a thread of its own, which waits for news of the run.
+#include <math.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "proto/frame.h"
+#include "server/log.h"
+#include "server/routes_inside.h"
+
+#define PROGRESS_SECONDS 0.5   // between two events that tell how far the run is
+#define HEARTBEAT_SECONDS 10.0 // a peer that is gone is noticed when something is sent to it
+#define WAIT_SECONDS 0.5       // the server looks in between whether the peer is still there
+
+static bool stream_begins(struct call *c) {
+    if (atomic_fetch_add(&c->routes->streams, 1) < ROUTES_STREAMS_MAX)
+        return true;
+    atomic_fetch_sub(&c->routes->streams, 1);
+    reply_problem(c->reply, 503, NULL, "%d streams are open already", ROUTES_STREAMS_MAX);
+    return false;
+}
+
+// Whether nothing more will come. Ask it before looking for what has come.
+static bool is_over(struct run *run) {
+    return run_state_is_final(run_status(run).state) || run_stopping(run);
+}
+
+// ---- Events -----------------------------------------------------------------------------------
+
+struct event_stream {
+    struct routes *routes;
+    struct run *run;
+    uint64_t offset, number; // of the next line in the event log; the first is number 0
+    uint64_t news;
+    uint64_t told_step; // of the last event about progress
+    double progress_at, sent_at;
+    char *text; // being sent
+    size_t bytes, sent;
+    bool progress_told, ended;
+};
+
+static void events_close(void *context) {
+    struct event_stream *s = context;
+    atomic_fetch_sub(&s->routes->streams, 1);
+    run_release(s->run);
+    free(s->text);
+    free(s);
+}
+
+static void event_put(struct event_stream *s, const char *id, const char *kind, const char *json) {
+    size_t bytes = 64 + strlen(id) + strlen(kind) + strlen(json);
+    free(s->text);
+    s->text = malloc(bytes);
+    s->sent = 0;
+    s->bytes = s->text == NULL ? 0
+                               : (size_t)snprintf(s->text, bytes, "%s%s%sevent: %s\ndata: %s\n\n",
+                                                  id[0] != '\0' ? "id: " : "", id,
+                                                  id[0] != '\0' ? "\n" : "", kind, json);
+}
+
+// The next line of the log, as it stands there; its number is its id.
+static bool put_logged(struct event_stream *s) {
+    struct journal *journal = run_journal(s->run);
+    struct faults faults = {0};
+    char id[24];
+    char *line = journal != NULL ? journal_event_next(journal, &s->offset) : NULL;
+    if (line == NULL)
+        return false;
+    cJSON *json = json_parse(line, strlen(line), &faults);
+    const char *kind = cJSON_GetStringValue(json_member(json, "event"));
+    snprintf(id, sizeof id, "%llu", (unsigned long long)++s->number);
+    event_put(s, id, kind != NULL ? kind : "message", line);
+    cJSON_Delete(json);
+    faults_free(&faults);
+    free(line);
+    return true;
+}
+
+static void put_progress(struct event_stream *s, const struct run_status *status) {
+    cJSON *json = cJSON_CreateObject();
+    double work = (double)status->particles * (double)status->step;
+    cJSON_AddStringToObject(json, "event", "progress");
+    cJSON_AddStringToObject(json, "state", run_state_name(status->state));
+    reply_add(json, "step", (double)status->step);
+    reply_add(json, "time", status->time);
+    reply_add(json, "end_time", status->end_time);
+    reply_add(json, "progress", routes_progress(status));
+    reply_add(json, "eta_s", status->eta_s);
+    reply_add(json, "dt", status->dt);
+    reply_add(json, "wall_s", status->wall_s);
+    reply_add(json, "particle_steps_per_s", status->wall_s > 0 ? work / status->wall_s : NAN);
+    char *text = json_print(json, false);
+    if (text != NULL)
+        event_put(s, "", "progress", text);
+    free(text);
+    cJSON_Delete(json);
+    s->progress_at = run_clock();
+    s->progress_told = true;
+    s->told_step = status->step;
+}
+
+// The last that is sent: so that a client can tell the end of the run from a broken line.
+static void put_end(struct event_stream *s) {
+    char json[96];
+    bool over = run_state_is_final(run_status(s->run).state);
+    snprintf(json, sizeof json, "{\"event\":\"end\",\"state\":\"%s\",\"reason\":\"%s\"}",
+             run_state_name(run_status(s->run).state), over ? "over" : "stopping");
+    event_put(s, "", "end", json);
+    s->ended = true;
+}
+
+static bool events_next(struct event_stream *s) {
+    bool over = is_over(s->run);
+    if (put_logged(s))
+        return true;
+    struct run_status status = run_status(s->run);
+    double t = run_clock();
+    if (!s->progress_told ||
+        (status.step != s->told_step && (over || t - s->progress_at >= PROGRESS_SECONDS))) {
+        put_progress(s, &status);
+        return true;
+    }
+    if (over) {
+        put_end(s);
+        return true;
+    }
+    if (t - s->sent_at < HEARTBEAT_SECONDS)
+        return false;
+    free(s->text);
+    s->text = strdup(": still here\n\n");
+    s->bytes = s->text != NULL ? strlen(s->text) : 0;
+    s->sent = 0;
+    return true;
+}
+
+static size_t events_produce(void *context, char *out, size_t bytes) {
+    struct event_stream *s = context;
+    if (s->sent == s->bytes) {
+        if (s->ended)
+            return HTTP_END;
+        if (!events_next(s)) {
+            s->news = run_news(s->run, s->news, WAIT_SECONDS);
+            return 0;
+        }
+        s->sent_at = run_clock();
+    }
+    size_t n = s->bytes - s->sent < bytes ? s->bytes - s->sent : bytes;
+    memcpy(out, s->text + s->sent, n);
+    s->sent += n;
+    return n;
+}
+
+// Moves to the state that the run is in: the last event of a state in the log.
+static void events_skip_to_state(struct event_stream *s) {
+    struct journal *journal = run_journal(s->run);
+    uint64_t offset = 0, number = 0;
+    if (journal == NULL)
+        return;
+    for (;;) {
+        uint64_t at = offset;
+        char *line = journal_event_next(journal, &offset);
+        if (line == NULL)
+            return;
+        if (strncmp(line, "{\"event\":\"state\"", 16) == 0) {
+            s->offset = at;
+            s->number = number;
+        }
+        number++;
+        free(line);
+    }
+}
+
+static void events_skip(struct event_stream *s, uint64_t last) {
+    struct journal *journal = run_journal(s->run);
+    char *line;
+    while (s->number < last && journal != NULL &&
+           (line = journal_event_next(journal, &s->offset)) != NULL) {
+        s->number++;
+        free(line);
+    }
+}
+
+void routes_serve_events(struct call *c) {
+    const char *last = http_header(c->request, "Last-Event-ID");
+    if (last != NULL &&
+        (last[0] == '\0' || strlen(last) > 19 || strspn(last, "0123456789") != strlen(last))) {
+        reply_problem(c->reply, 400, NULL,
+                      "Last-Event-ID must be the id of an event of this run, a whole number, got "
+                      "%.40s",
+                      last);
+        return;
+    }
+    struct run *run = routes_run_of(c);
+    if (run == NULL)
+        return;
+    struct event_stream *s = stream_begins(c) ? calloc(1, sizeof *s) : NULL;
+    if (s == NULL) {
+        run_release(run);
+        return;
+    }
+    *s = (struct event_stream){.routes = c->routes, .run = run, .sent_at = run_clock()};
+    if (last != NULL)
+        events_skip(s, strtoull(last, NULL, 10));
+    else
+        events_skip_to_state(s);
+    c->reply->status = 200;
+    c->reply->type = "text/event-stream";
+    c->reply->produce = events_produce;
+    c->reply->close = events_close;
+    c->reply->stream = s;
+}
+
+// ---- Frames -----------------------------------------------------------------------------------
+
+struct frame_stream {
+    struct routes *routes;
+    struct run *run;
+    uint64_t next; // frame
+    uint64_t news;
+    size_t max_particles; // 0: all
+    struct journal_map map;
+    bool mapped;
+    unsigned char *thinned;
+    const unsigned char *at; // what is left of the frame being sent
+    size_t left;
+};
+
+static void frame_done(struct frame_stream *s) {
+    if (s->mapped)
+        journal_frame_unmap(&s->map);
+    free(s->thinned);
+    s->mapped = false;
+    s->thinned = NULL;
+    s->left = 0;
+}
+
+static void frames_close(void *context) {
+    struct frame_stream *s = context;
+    frame_done(s);
+    atomic_fetch_sub(&s->routes->streams, 1);
+    run_viewers(s->run, -1);
+    run_release(s->run);
+    free(s);
+}
+
+// Header of a frame -> plan of the same frame with every `stride`-th particle. The plan borrows
+// from the JSON and from `probes`.
+static bool thin_plan(const cJSON *header, size_t stride, char *probes, struct frame_plan *out) {
+    const cJSON *field, *shape = NULL;
+    size_t count = (size_t)json_member(header, "count")->valuedouble;
+    *out = (struct frame_plan){
+        .run = json_member(header, "run")->valuestring,
+        .epoch = (uint32_t)json_member(header, "epoch")->valuedouble,
+        .seq = (uint64_t)json_member(header, "seq")->valuedouble,
+        .step = (uint64_t)json_member(header, "step")->valuedouble,
+        .time = json_member(header, "time")->valuedouble,
+        .dimension = (int)json_member(header, "dimension")->valuedouble,
+        .count = (count + stride - 1) / stride,
+        .fbar = cJSON_IsTrue(json_member(header, "fbar")),
+        .state = json_member(header, "state")->valuestring,
+        .end = cJSON_IsTrue(json_member(header, "end")),
+        .probes = probes,
+    };
+    cJSON_ArrayForEach(field, json_member(header, "fields")) {
+        struct frame_field *to = &out->fields[out->n_fields++];
+        *to = (struct frame_field){.name = json_member(field, "name")->valuestring,
+                                   .unit = json_member(field, "unit")->valuestring,
+                                   .dtype = json_member(field, "dtype")->valuestring};
+        cJSON_ArrayForEach(shape, json_member(field, "shape")) {
+            to->shape[to->rank] = to->rank == 0 ? out->count : (size_t)shape->valuedouble;
+            to->rank++;
+        }
+    }
+    return frame_layout(out) == 0;
+}
+
+// A new frame with fewer particles, of a whole frame that this daemon wrote. NULL without memory.
+static unsigned char *frame_thin(const struct journal_map *map, size_t max_particles,
+                                 size_t *bytes) {
+    struct faults faults = {0};
+    struct frame_view view;
+    struct frame_plan plan;
+    unsigned char *out = NULL;
+    char why[128];
+    if (frame_peek(map->frame, map->bytes, &view, why, sizeof why) != 0)
+        return NULL;
+    cJSON *header = json_parse(view.header, view.header_bytes, &faults);
+    char *probes = header != NULL ? json_print(json_member(header, "probes"), false) : NULL;
+    size_t count = header != NULL ? (size_t)json_member(header, "count")->valuedouble : 0;
+    size_t stride = (count + max_particles - 1) / max_particles;
+    if (probes != NULL && thin_plan(header, stride > 0 ? stride : 1, probes, &plan))
+        out = aligned_alloc(FRAME_ALIGN, plan.total_bytes);
+    if (out != NULL) {
+        frame_write_header(&plan, out);
+        for (size_t k = 0; k < plan.n_fields; k++) {
+            const cJSON *field = cJSON_GetArrayItem(json_member(header, "fields"), (int)k);
+            const unsigned char *from =
+                map->frame + (size_t)json_member(field, "offset")->valuedouble;
+            size_t row = plan.count > 0 ? plan.fields[k].bytes / plan.count : 0;
+            for (size_t p = 0; p < plan.count; p++)
+                memcpy(out + plan.fields[k].offset + p * row, from + p * stride * row, row);
+        }
+        frame_seal(out);
+        *bytes = plan.total_bytes;
+    }
+    free(probes);
+    cJSON_Delete(header);
+    faults_free(&faults);
+    return out;
+}
+
+// Whether there is a frame to send: the newest, whatever came between.
+static bool frames_next(struct frame_stream *s) {
+    struct journal *journal = run_journal(s->run);
+    char why[JOURNAL_WHY];
+    uint64_t n = journal != NULL ? journal_n_frames(journal) : 0;
+    frame_done(s);
+    if (n <= s->next)
+        return false;
+    s->mapped = journal_frame_map(journal, n - 1, &s->map, why);
+    if (!s->mapped) {
+        log_warn("stream", "run=%s seq=%llu why=\"%s\"", run_id(s->run), (unsigned long long)n - 1,
+                 why);
+        s->next = n;
+        return false;
+    }
+    atomic_fetch_add(&s->routes->stream_skipped, n - 1 - s->next);
+    atomic_fetch_add(&s->routes->stream_sent, 1);
+    s->next = n;
+    s->at = s->map.frame;
+    s->left = s->map.bytes;
+    if (s->max_particles > 0) {
+        s->thinned = frame_thin(&s->map, s->max_particles, &s->left);
+        s->at = s->thinned;
+        if (s->thinned == NULL)
+            s->left = 0;
+    }
+    return s->left > 0;
+}
+
+static size_t frames_produce(void *context, char *out, size_t bytes) {
+    struct frame_stream *s = context;
+    if (s->left == 0) {
+        bool over = is_over(s->run);
+        if (!frames_next(s)) {
+            if (over)
+                return HTTP_END;
+            s->news = run_news(s->run, s->news, WAIT_SECONDS);
+            return 0;
+        }
+    }
+    size_t n = s->left < bytes ? s->left : bytes;
+    memcpy(out, s->at, n);
+    s->at += n;
+    s->left -= n;
+    return n;
+}
+
+void routes_serve_stream(struct call *c) {
+    char text[32];
+    size_t most = 0;
+    if (http_query(c->request, "max_particles", text, sizeof text)) {
+        most = strlen(text) <= 15 && strspn(text, "0123456789") == strlen(text)
+                   ? (size_t)strtoull(text, NULL, 10)
+                   : 0;
+        if (most == 0) {
+            reply_problem(c->reply, 400, NULL,
+                          "max_particles must be a whole number, 1 or more, got %.40s", text);
+            return;
+        }
+    }
+    struct run *run = routes_run_of(c);
+    if (run == NULL)
+        return;
+    struct frame_stream *s = stream_begins(c) ? calloc(1, sizeof *s) : NULL;
+    if (s == NULL) {
+        run_release(run);
+        return;
+    }
+    uint64_t n = run_journal(run) != NULL ? journal_n_frames(run_journal(run)) : 0;
+    *s = (struct frame_stream){
+        .routes = c->routes, .run = run, .max_particles = most, .next = n > 0 ? n - 1 : 0};
+    run_viewers(run, 1);
+    c->reply->status = 200;
+    c->reply->type = "application/vnd.fbard.frame";
+    c->reply->produce = frames_produce;
+    c->reply->close = frames_close;
+    c->reply->stream = s;
+}

@@ -1,0 +1,324 @@
+"""Watching a run: server-sent events, the stream of frames, /metrics."""
+import http.client
+import json
+import re
+import shutil
+import struct
+import subprocess
+import threading
+import time
+
+import numpy as np
+import pytest
+from boxes import WATER_PARTICLES, endless, water
+from fbard import FINAL, PATIENCE, is_sanitized, strict_json, until
+from frames import Frame
+
+
+class Stream:
+    """An answer that is read as it comes. Every byte is kept in `seen`."""
+
+    def __init__(self, daemon, path, headers=None, seconds=PATIENCE):
+        self.connection = http.client.HTTPConnection(daemon.host, timeout=seconds)
+        self.connection.request("GET", path, headers=headers or {})
+        self.answer = self.connection.getresponse()
+        self.type = self.answer.getheader("content-type")
+        self.status = self.answer.status
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.connection.close()
+
+    def events(self):
+        """(id or None, event, data) of each; heartbeats are passed over."""
+        assert (self.status, self.type) == (200, "text/event-stream")
+        fields = {}
+        for line in self.answer:
+            line = line.decode().rstrip("\n")
+            if line == "":
+                if fields:
+                    yield fields.get("id"), fields["event"], strict_json(fields["data"])
+                fields = {}
+            elif not line.startswith(":"):
+                key, value = line.split(": ", 1)
+                assert key in ("id", "event", "data") and key not in fields, line
+                fields[key] = value
+        assert fields == {}, "an event that is cut"
+
+    def frames(self):
+        """Each frame's bytes, to the end of the stream."""
+        assert (self.status, self.type) == (200, "application/vnd.fbard.frame")
+        while True:
+            preamble = self.answer.read(64)
+            if preamble == b"":
+                return
+            assert preamble[:8] == b"FBARFRM1"
+            (total,) = struct.unpack_from("<Q", preamble, 16)
+            rest = self.answer.read(total - 64)
+            assert len(rest) == total - 64
+            yield preamble + rest
+
+
+# ---- Events ----
+
+
+def test_events_tell_the_life_of_a_run(daemon, name):
+    daemon.create(water(), id=name, start=False)
+    with Stream(daemon, f"/v1/runs/{name}/events") as stream:
+        events = stream.events()
+        number, kind, data = next(events)
+        assert (number, kind, data["state"]) == ("1", "state", "paused")
+        assert next(events)[1] == "progress", "how far it is, whatever its state"
+        daemon.patch(name, {"fbar": False, "damping": {"mass": 0.5}})
+        daemon.act(name, "start")
+        rest = list(events)
+    kinds = [k for _, k, _ in rest]
+    assert kinds[-1] == "end" and rest[-1][2]["state"] == "completed"
+    states = [d["state"] for _, k, d in rest if k == "state"]
+    assert states == ["running", "completed"]
+    ((number, _, change),) = [e for e in rest if e[1] == "config"]
+    assert (number, change["patch"], change["step"]) == ("2", {"fbar": False, "damping": {"mass": 0.5}}, 0)
+    ids = [int(i) for i, _, _ in rest if i is not None]
+    assert ids == list(range(2, 2 + len(ids))), "dense, and none twice"
+    assert all(i is None for i, k, _ in rest if k in ("progress", "end")), "what is not kept has no id"
+    last = [d for _, k, d in rest if k == "progress"][-1]
+    assert (last["step"], last["progress"]) == (100, 1)
+    daemon.away(name)
+
+
+def test_events_are_replayed_from_any_of_them(daemon, name):
+    daemon.create(water(), id=name, start=False)
+    for k in range(5):
+        daemon.patch(name, {"damping": {"mass": 0.1 * (k + 1)}})
+    daemon.act(name, "start")
+    daemon.wait(name, "completed")
+
+    def logged(**headers):
+        with Stream(daemon, f"/v1/runs/{name}/events", headers) as stream:
+            return [e for e in stream.events() if e[0] is not None]
+
+    everything = logged(**{"Last-Event-ID": "0"})
+    assert [int(e[0]) for e in everything] == list(range(1, len(everything) + 1))
+    assert [e[1] for e in everything] == ["state"] + ["config"] * 5 + ["state", "state"]
+    assert "check" not in json.dumps(everything), "the file's own"
+    for k in range(len(everything) + 2):
+        assert logged(**{"Last-Event-ID": str(k)}) == everything[k:]
+    assert logged() == everything[-1:], "without an id, from the present state on"
+    daemon.away(name)
+
+
+def test_events_are_replayed_after_kill_9(fresh, name):
+    d = fresh()
+    d.start()
+    d.create(endless(), id=name)
+    d.wait_step(name, 20)
+    with Stream(d, f"/v1/runs/{name}/events", {"Last-Event-ID": "0"}) as stream:
+        events = stream.events()
+        before = [next(events), next(events)]
+    d.kill()
+    d.start()
+    d.wait(name, "running")
+    with Stream(d, f"/v1/runs/{name}/events", {"Last-Event-ID": "0"}) as stream:
+        events = stream.events()
+        after = [next(events) for _ in range(3)]
+    assert after[:2] == before
+    assert (after[2][0], after[2][2]["state"]) == ("3", "running")
+    d.act(name, "cancel")
+
+
+def test_events_of_a_daemon_that_stops_end_and_say_so(fresh, name):
+    d = fresh()
+    d.start()
+    d.create(endless(), id=name)
+    d.wait_step(name, 5)
+    with Stream(d, f"/v1/runs/{name}/events") as stream, Stream(d, f"/v1/runs/{name}/stream") as frames:
+        began = time.monotonic()
+        ending = threading.Thread(target=d.stop)
+        ending.start()
+        events = list(stream.events())
+        list(frames.frames())
+        ending.join()
+    assert events[-1][1:] == ("end", {"event": "end", "state": "running", "reason": "stopping"})
+    assert time.monotonic() - began < (60 if is_sanitized() else 10)
+
+
+@pytest.mark.parametrize("bad", ["x", "-1", "1.5", "", "1e3", "99999999999999999999"])
+def test_events_after_no_event_are_refused(daemon, name, bad):
+    daemon.create(water(), id=name, start=False)
+    reply = daemon.ask("GET", f"/v1/runs/{name}/events", headers={"Last-Event-ID": bad}, status=400)
+    assert "Last-Event-ID" in reply.json["detail"]
+    daemon.away(name)
+    daemon.ask("GET", f"/v1/runs/{name}/events", status=404)
+
+
+def test_readers_that_hang_up_are_noticed_while_nothing_happens(daemon, name):
+    daemon.create(endless(), id=name, start=False)
+    until(lambda: daemon.frames(name))
+
+    def open_now():
+        return metrics(daemon)[("fbard_streams", "")]
+
+    before = open_now()
+    streams = [Stream(daemon, f"/v1/runs/{name}/{kind}") for kind in ("events", "stream") * 4]
+    for stream in streams:
+        stream.answer.read(10)
+    assert open_now() == before + 8
+    for stream in streams:
+        stream.connection.sock and stream.connection.sock.close()
+        stream.answer.close()
+        stream.connection.close()
+    until(lambda: open_now() == before, 10)
+    daemon.away(name)
+
+
+# ---- Frames as they come ----
+
+
+def test_stream_gives_the_published_bytes_to_the_end(daemon, name):
+    daemon.create(water(), id=name, start=False)
+    until(lambda: daemon.frames(name))
+    with Stream(daemon, f"/v1/runs/{name}/stream") as stream:
+        frames = stream.frames()
+        blocks = [next(frames)]
+        while not Frame(blocks[-1]).header["end"]:
+            daemon.act(name, "step", {"steps": 10})
+            blocks.append(next(frames))
+        assert list(frames) == []
+    assert [Frame(b).header["seq"] for b in blocks] == list(range(11))
+    for seq, block in enumerate(blocks):
+        assert block == daemon.frame(name, seq)
+    daemon.away(name)
+
+
+def test_stream_of_a_run_that_is_over_is_its_last_frame(daemon, name):
+    daemon.create(water(time={"end": 0.02}), id=name)
+    daemon.wait(name, "completed")
+    with Stream(daemon, f"/v1/runs/{name}/stream") as stream:
+        (block,) = stream.frames()
+    assert block == daemon.frame(name, "latest")
+    daemon.away(name)
+
+
+def test_stream_reader_that_is_slow_gets_the_newest(daemon, name):
+    scene = water(time={"end": 2}, output={"interval": 0.001, "fields": ["position", "velocity", "stress"]})
+    daemon.create(scene, id=name, start=False)
+    until(lambda: daemon.frames(name))
+    with Stream(daemon, f"/v1/runs/{name}/stream") as stream:
+        frames = stream.frames()
+        seqs = [Frame(next(frames)).header["seq"]]
+        daemon.act(name, "start")
+        n = daemon.wait(name, "completed") and len(daemon.frames(name))
+        seqs += [Frame(b).header["seq"] for b in frames]
+    assert seqs == sorted(set(seqs)) and seqs[-1] == n - 1
+    assert len(seqs) < n, "2001 frames of some 10 kB do not fit in what a socket holds"
+    daemon.away(name)
+
+
+@pytest.mark.parametrize("most", [1, 7, 100, WATER_PARTICLES - 1, WATER_PARTICLES, 10**9])
+def test_stream_is_thinned(daemon, name, most):
+    daemon.create(water(time={"end": 0.02}), id=name)
+    daemon.wait(name, "completed")
+    whole = Frame(daemon.frame(name, "latest"))
+    with Stream(daemon, f"/v1/runs/{name}/stream?max_particles={most}") as stream:
+        (block,) = stream.frames()
+    thin = Frame(block)  # which checks digest, lengths and places
+    stride = -(-WATER_PARTICLES // most)
+    assert thin.header["count"] == -(-WATER_PARTICLES // stride) <= most
+    for field in whole.header["fields"]:
+        np.testing.assert_array_equal(thin[field["name"]], whole[field["name"]][::stride])
+    for key in ("run", "seq", "step", "time", "state", "end", "probes", "fbar", "dimension"):
+        assert thin.header[key] == whole.header[key]
+    daemon.away(name)
+
+
+@pytest.mark.parametrize("bad", ["0", "-1", "x", "", "1.5", "9" * 20])
+def test_stream_thinned_to_nonsense_is_refused(daemon, name, bad):
+    daemon.create(water(), id=name, start=False)
+    daemon.ask("GET", f"/v1/runs/{name}/stream?max_particles={bad}", status=400)
+    daemon.away(name)
+
+
+def test_run_does_not_wait_for_readers_of_streams(daemon, name):
+    """Readers that never read: the run goes on, at its speed."""
+    def seconds(run):
+        return daemon.wait(run, "completed")["performance"]["wall_s"]
+
+    scene = water(time={"end": 0.5}, output={"interval": 0.001})
+    daemon.create(scene, id=name)
+    alone = seconds(name)
+    daemon.create(scene, id=name + "x", start=False)
+    until(lambda: daemon.frames(name + "x"))
+    streams = [Stream(daemon, f"/v1/runs/{name}x/stream") for _ in range(6)]
+    daemon.act(name + "x", "start")
+    assert seconds(name + "x") < 3 * alone + 1
+    for stream in streams:
+        stream.connection.close()
+        stream.answer.close()
+    daemon.away(name, name + "x")
+
+
+# ---- Metrics ----
+
+
+def metrics(daemon):
+    """{(name, labels): value}."""
+    reply = daemon.ask("GET", "/metrics")
+    assert reply.headers["content-type"] == "text/plain; version=0.0.4; charset=utf-8"
+    found = {}
+    for line in reply.body.decode().splitlines():
+        if not line.startswith("#"):
+            key, labels, value = re.fullmatch(r"([a-z_]+)(\{.*\})? (\S+)", line).groups()
+            assert (key, labels or "") not in found, line
+            found[key, labels or ""] = float(value)
+    return found
+
+
+def test_metrics_count_what_was_done(daemon, name):
+    before = metrics(daemon)
+    daemon.create(water(), id=name, start=False)
+    daemon.act(name, "step", {"steps": 35})
+    daemon.wait(name, "paused")
+    daemon.ask("GET", "/v1/runs/none", status=404)
+    daemon.ask("GET", "/nowhere", status=404)
+    daemon.ask("PUT", f"/v1/runs/{name}/recorders/me", {"acked": 1})
+    now = metrics(daemon)
+
+    def grown(key, labels=""):
+        return now[key, labels] - before.get((key, labels), 0)
+
+    assert grown("fbard_steps_total") == 35
+    assert grown("fbard_particle_steps_total") == 35 * WATER_PARTICLES
+    assert grown("fbard_frames_published_total", '{class="zeromq"}') == 4
+    assert grown("fbard_runs", '{state="paused"}') == 1
+    assert grown("fbard_http_requests_total", '{method="GET",route="/v1/runs/{id}",status="404"}') == 1
+    assert grown("fbard_http_requests_total", '{method="",route="",status="404"}') == 1
+    assert grown("fbard_http_requests_total", '{method="POST",route="/v1/runs",status="201"}') == 1
+    assert now["fbard_recorder_lag_frames", f'{{run="{name}",recorder="me"}}'] == 2
+    assert now["fbard_run_step", f'{{run="{name}"}}'] == 35
+    assert now["fbard_journal_bytes", ""] > 0 and now["process_resident_memory_bytes", ""] > 1e6
+    assert sum(v for (k, label), v in now.items() if k == "fbard_run_phase_seconds" and name in label) > 0
+    daemon.away(name)
+    assert not any(name in label for _, label in metrics(daemon)), "what is gone is not told of"
+
+
+def test_metrics_pass_promtool(daemon, name):
+    if shutil.which("promtool") is None:
+        pytest.skip("no promtool (Debian: prometheus)")
+    daemon.create(water(), id=name)
+    daemon.ask("PUT", f"/v1/runs/{name}/recorders/me", {"acked": -1})
+    text = daemon.ask("GET", "/metrics").body
+    check = subprocess.run(["promtool", "check", "metrics"], input=text, capture_output=True, timeout=60)
+    assert (check.returncode, check.stdout + check.stderr) == (0, b"")
+    daemon.wait(name, "completed")
+    daemon.away(name)
+
+
+def test_stepping_shows_while_it_goes_on(daemon, name):
+    daemon.create(endless(), id=name)
+    daemon.wait_step(name, 1)
+    first = metrics(daemon)["fbard_steps_total", ""]
+    until(lambda: metrics(daemon)["fbard_steps_total", ""] > first)
+    assert daemon.run(name)["state"] not in FINAL
+    daemon.away(name)
