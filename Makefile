@@ -9,6 +9,8 @@ PACKAGES = build-essential pkg-config libmicrohttpd-dev libcjson-dev libzmq3-dev
 # Needed by some targets only: clang builds and the fuzzers; `make check-long`.
 PACKAGES_CLANG = clang-14 libomp-14-dev
 PACKAGES_LONG = $(PACKAGES_CLANG) python3-paraview prometheus
+# Pictures of the report; `make check` tests it, and so needs them too.
+PACKAGES_REPORT = python3-matplotlib python3-pil
 
 CC ?= gcc
 ifeq ($(origin CC),default)
@@ -72,7 +74,7 @@ $(B)/obj/server/mpm/kernels.o: ALL_CFLAGS += $(if $(LEVELS),-DMPM_HAS_LANES)
 $(call levels,$(LANES_SRC)): ALL_CFLAGS += $(if $(filter asan tsan debug coverage,$(VARIANT)),-O1,-O2) \
 	-fno-tree-vectorize -fno-tree-slp-vectorize
 
-.PHONY: all programs deps deps-long libmpm demo check check-all check-layers check-unit check-physics check-api \
+.PHONY: all programs deps deps-long deps-report libmpm demo report report-page check check-all check-layers check-unit check-physics check-api \
 	check-cli check-loss check-asan check-clang check-fuzz check-tsan unit-programs check-long bench bench-solver bench-peer \
 	bench-recording bench-status fuzz install uninstall format clean help
 .DELETE_ON_ERROR:
@@ -179,8 +181,11 @@ deps: ## install what is missing (Debian packages; as root or with sudo)
 deps-long: deps
 	@$(MAKE) --no-print-directory deps PACKAGES="$(PACKAGES_LONG)"
 
+deps-report: deps
+	@$(MAKE) --no-print-directory deps PACKAGES="$(PACKAGES_REPORT)"
+
 # Everything that a commit must pass. deps first, alone: what follows asks pkg-config.
-check: deps ## build and run all tests (installs what is missing)
+check: deps-report ## build and run all tests (installs what is missing)
 	@$(MAKE) --no-print-directory -j$$(nproc) all programs
 	@$(MAKE) --no-print-directory check-all
 
@@ -257,7 +262,7 @@ check-clang: ## warnings and unit tests with clang 14
 	$(Q)$(MAKE) --no-print-directory CC=clang-14 VARIANT=clang OPENMP=-fopenmp=libomp CFLAGS=-Werror \
 	  build/clang/fbard build/clang/fbar check-unit
 
-check-long: deps-long ## the longer verification: minutes to hours
+check-long: deps-long deps-report ## the longer verification: minutes to hours
 	@FBARD_LONG=1 $(MAKE) --no-print-directory check-all check-clang check-tsan
 
 bench: bench-solver bench-recording bench-status ## speed: the kernels, what recording costs, how fast the daemon answers
@@ -279,6 +284,15 @@ bench-status: all ## how fast the daemon answers while a run uses all cores, and
 demo: deps ## the paper's dam break, F-bar on and off: pictures in build/demo (under 4 minutes)
 	@$(MAKE) --no-print-directory all
 	@scenes/demo.sh
+
+# SIZE=small takes minutes, SIZE=paper hours; both go on where they were stopped or killed (bench/report/README.md).
+SIZE ?= small
+report: deps-report ## the paper's figures with our numbers: build/report/SIZE/report.html (SIZE=small, minutes; SIZE=paper, hours)
+	@$(MAKE) --no-print-directory all
+	@$(PYTHON) bench/report $(SIZE) $(REPORT)
+
+report-page: deps-report ## the same page of what was run so far; runs nothing
+	@$(PYTHON) bench/report $(SIZE) --page
 
 install: all ## into PREFIX (default /usr/local), under DESTDIR
 	install -d $(DESTDIR)$(PREFIX)/bin
