@@ -31,8 +31,11 @@ bool guard_init(struct guard *guard, const char *bound, const char *token_file, 
             fclose(file);
         return false;
     }
-    if ((info.st_mode & 077) != 0)
-        log_warn("token_file", "file=\"%s\" others can read it: chmod 600", token_file);
+    if ((info.st_mode & 077) != 0) {
+        snprintf(why, why_bytes, "%s: others can read it: chmod 600", token_file);
+        fclose(file);
+        return false;
+    }
     size_t n = fread(text, 1, TOKEN_MAX, file);
     fclose(file);
     while (n > 0 && strchr(" \t\r\n", text[n - 1]) != NULL)

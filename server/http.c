@@ -16,6 +16,7 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <sys/resource.h>
 #include <sys/socket.h>
 #include <time.h>
 #include <unistd.h>
@@ -29,6 +30,8 @@
 #define STOP_SECONDS 2.0 // for what is being answered when the daemon ends
 #define PEER_SECONDS 30  // what was sent and is not acknowledged for so long ends the connection
 #define IDLE_SECONDS 30
+#define THREAD_STACK (1024 * 1024)    // JSON is 64 deep at most; the usual 8 MiB are address space
+#define CONNECTION_MEMORY (64 * 1024) // the head of a request and its pieces; see HTTP_HEADER_BYTES
 #define BACKLOG 128
 #define DRAIN_MAX ((uint64_t)1 << 30) // bytes of an unwanted body that are read before giving up
 #define STREAM_BLOCK (64 * 1024)
@@ -56,11 +59,15 @@ struct http_request {
     const struct http_service *service;
     struct MHD_Connection *connection;
     const char *method;
-    char *path, *query; // as sent; query may be NULL
+    char *target;       // as sent, then cut into:
+    char *path, *query; // query may be NULL
+    char *authority;    // of a target in absolute form, else NULL
+    size_t target_bytes;
     char *body;
     size_t bytes, capacity;
     uint64_t drained;
     bool begun, refused, replied;
+    bool closes; // the connection after this: where the next request begins is not known
     struct http_reply reply;
 };
 
@@ -71,7 +78,7 @@ struct http_server {
     int listener; // closed by quiescing
     pthread_mutex_t lock;
     struct peer *peers;
-    struct http_counts counts;
+    struct http_counts counts; // most, most_of_address: fixed from the start on
 };
 
 // A body without end, and the socket on which its reader may go away.
@@ -90,6 +97,9 @@ const char *http_path(const struct http_request *q) {
 }
 const char *http_header(const struct http_request *q, const char *name) {
     return MHD_lookup_connection_value(q->connection, MHD_HEADER_KIND, name);
+}
+const char *http_host(const struct http_request *q) {
+    return q->authority != NULL ? q->authority : http_header(q, "Host");
 }
 const char *http_body(const struct http_request *q, size_t *bytes) {
     *bytes = q->bytes;
@@ -206,9 +216,9 @@ static void make_place(struct http_server *server, struct peer *newest) {
             all++;
             alike += same_address(p, newest);
         }
-    if (alike > HTTP_CONNECTIONS_OF_ADDRESS)
+    if (alike > server->counts.most_of_address)
         newest->refused = !evict(server, newest, newest);
-    else if (all > HTTP_CONNECTIONS)
+    else if (all > server->counts.most)
         newest->refused = !evict(server, newest, NULL);
     server->counts.refused += newest->refused;
 }
@@ -344,7 +354,7 @@ static enum MHD_Result send_reply(struct http_request *q) {
     struct MHD_Response *response = make_response(reply, q->peer->socket);
     if (response == NULL)
         return MHD_NO;
-    if (endless || q->peer->refused)
+    if (endless || q->peer->refused || q->closes)
         MHD_add_response_header(response, "Connection", "close");
     if (endless) // it is quiet while the run is; a peer that is gone is the kernel's to find
         MHD_set_connection_option(q->connection, MHD_CONNECTION_OPTION_TIMEOUT, 0u);
@@ -363,6 +373,30 @@ static enum MHD_Result send_reply(struct http_request *q) {
 
 // ---- Requests ---------------------------------------------------------------------------------
 
+// Origin form (/path?query) or absolute form (http://authority/path?query), which clients use
+// towards proxies and every server must take (RFC 9112, 3.2.2).
+static void target_split(struct http_request *q) {
+    static char root[] = "/";
+    const char *after = strncasecmp(q->target, "http://", 7) == 0    ? q->target + 7
+                        : strncasecmp(q->target, "https://", 8) == 0 ? q->target + 8
+                                                                     : NULL;
+    q->path = q->target;
+    if (after != NULL) {
+        size_t n = strcspn(after, "/?");
+        q->authority = strndup(after, n);
+        if (q->authority == NULL) {
+            q->path = NULL; // refused
+            return;
+        }
+        q->path = q->target + (after - q->target) + n;
+    }
+    q->query = strchr(q->path, '?');
+    if (q->query != NULL)
+        *q->query++ = '\0';
+    if (after != NULL && q->path[0] == '\0')
+        q->path = root;
+}
+
 // The first that libmicrohttpd tells of a request: its target as it was sent, before any decoding.
 static void *on_target(void *cls, const char *target, struct MHD_Connection *connection) {
     struct http_server *server = cls;
@@ -377,9 +411,10 @@ static void *on_target(void *cls, const char *target, struct MHD_Connection *con
     q->peer = info->socket_context;
     q->service = &server->service;
     q->reply.fd = -1;
-    q->path = strdup(target);
-    if (q->path != NULL && (q->query = strchr(q->path, '?')) != NULL)
-        *q->query++ = '\0';
+    q->target = strdup(target);
+    q->target_bytes = strlen(target);
+    if (q->target != NULL)
+        target_split(q);
     return q;
 }
 
@@ -393,7 +428,8 @@ static void on_completed(void *cls, struct MHD_Connection *connection, void **re
         return;
     peer_enter(q->server, q->peer, PEER_QUIET);
     reply_clear(&q->reply);
-    free(q->path);
+    free(q->target);
+    free(q->authority);
     free(q->body);
     free(q);
     *request = NULL;
@@ -408,13 +444,77 @@ static void refuse_size(struct http_request *q) {
     q->service->too_large(q->service->context, &q->reply);
 }
 
-static enum MHD_Result begin(struct http_request *q) {
+// Headers that decide who is asked, who asks, and where the request ends: twice, they let two
+// readers (a proxy and this server) see two requests.
+static const char *const singles[] = {"Host",         "Origin",          "Authorization",
+                                      "Content-Type", "Content-Length",  "Transfer-Encoding",
+                                      "If-Match",     "Idempotency-Key", "Last-Event-ID"};
+#define SINGLES (sizeof singles / sizeof *singles)
+
+struct head {
+    unsigned counts[SINGLES];
+    size_t bytes;
+    const char *fault; // what is wrong with it
+};
+
+static enum MHD_Result head_line(void *cls, enum MHD_ValueKind kind, const char *key,
+                                 size_t key_bytes, const char *value, size_t value_bytes) {
+    struct head *head = cls;
+    (void)kind;
+    (void)value;
+    head->bytes += key_bytes + value_bytes + 4; // ": ", CRLF
+    if (key == NULL || key_bytes == 0 || strcspn(key, " \t") != key_bytes)
+        head->fault = "a header's name is empty or has a blank in it";
+    for (size_t k = 0; key != NULL && k < SINGLES; k++)
+        head->counts[k] += strcasecmp(key, singles[k]) == 0;
+    return MHD_YES;
+}
+
+// Whether the head of the request is sound (RFC 9112, 3.2, 5.1, 6.3); else the reply is filled.
+static bool head_sound(struct http_request *q, const char *version) {
+    struct head head = {0};
+    char why[128];
+    const char *coding = http_header(q, "Transfer-Encoding"),
+               *length = http_header(q, "Content-Length");
+    MHD_get_connection_values_n(q->connection, MHD_HEADER_KIND, head_line, &head);
+    head.bytes += strlen(q->method) + strlen(version) + 4 + q->target_bytes;
+    for (size_t k = 0; k < SINGLES && head.fault == NULL; k++)
+        if (head.counts[k] > 1) {
+            snprintf(why, sizeof why, "the header %s may be sent once, came %u times", singles[k],
+                     head.counts[k]);
+            head.fault = why;
+        }
+    if (head.fault != NULL)
+        ;
+    else if (head.counts[0] == 0 && strcmp(version, "HTTP/1.0") != 0)
+        head.fault = "the Host header is missing";
+    else if (coding != NULL && strcasecmp(coding, "chunked") != 0)
+        head.fault = "Transfer-Encoding must be chunked";
+    else if (coding != NULL && length != NULL)
+        head.fault = "Transfer-Encoding and Content-Length exclude each other";
+    bool long_head = head.fault == NULL && head.bytes > HTTP_HEADER_BYTES;
+    if (long_head) {
+        snprintf(why, sizeof why, "the head of the request is over the limit of %d bytes",
+                 HTTP_HEADER_BYTES);
+        head.fault = why;
+    }
+    if (head.fault == NULL)
+        return true;
+    q->closes = true;
+    q->service->malformed(q->service->context, long_head ? 431 : 400, head.fault, &q->reply);
+    return false;
+}
+
+static enum MHD_Result begin(struct http_request *q, const char *version) {
     const char *text = http_header(q, "Content-Length"), *expect = http_header(q, "Expect");
     uint64_t length = text != NULL ? strtoull(text, NULL, 10) : 0;
     q->begun = true;
     if (q->peer->refused) {
         q->refused = true;
-        q->service->too_many(q->service->context, &q->reply);
+        q->service->too_many(q->service->context, &q->server->counts, &q->reply);
+    } else if (!head_sound(q, version)) {
+        q->refused = true;
+        return send_reply(q);
     } else {
         q->refused = !q->service->admit(q->service->context, q, &q->reply);
     }
@@ -447,13 +547,12 @@ static enum MHD_Result on_request(void *cls, struct MHD_Connection *connection, 
     struct http_request *q = *request;
     (void)cls;
     (void)url;
-    (void)version;
     if (q == NULL || q->path == NULL)
         return MHD_NO;
     q->connection = connection;
     q->method = method;
     if (!q->begun)
-        return begin(q);
+        return begin(q, version);
     if (*upload_bytes > 0) {
         q->drained += *upload_bytes;
         peer_enter(q->server, q->peer, PEER_QUIET); // makes progress
@@ -526,6 +625,15 @@ static char *file_text(const char *path, char *why, size_t why_bytes) {
     return text;
 }
 
+// A quarter of the descriptors that the process may have: a connection takes one, or two while a
+// frame is sent, and runs need theirs.
+static void set_limits(struct http_counts *counts) {
+    struct rlimit files;
+    rlim_t share = getrlimit(RLIMIT_NOFILE, &files) == 0 ? files.rlim_cur / 4 : HTTP_CONNECTIONS;
+    counts->most = share < HTTP_CONNECTIONS ? (unsigned)share : HTTP_CONNECTIONS;
+    counts->most_of_address = counts->most * HTTP_CONNECTIONS_OF_ADDRESS / HTTP_CONNECTIONS;
+}
+
 struct http_server *http_start(const struct http_address *address,
                                const struct http_service *service, char *url, size_t url_bytes,
                                char *why, size_t why_bytes) {
@@ -535,6 +643,7 @@ struct http_server *http_start(const struct http_address *address,
         return NULL;
     server->service = *service;
     server->listener = -1;
+    set_limits(&server->counts);
     pthread_mutex_init(&server->lock, NULL);
     if (tls && ((server->cert = file_text(address->tls_cert, why, why_bytes)) == NULL ||
                 (server->key = file_text(address->tls_key, why, why_bytes)) == NULL))
@@ -553,9 +662,11 @@ struct http_server *http_start(const struct http_address *address,
             MHD_USE_ITC | MHD_USE_ERROR_LOG | (tls ? MHD_USE_TLS : 0),
         0, NULL, NULL, on_request, server, MHD_OPTION_EXTERNAL_LOGGER, on_log, NULL,
         MHD_OPTION_LISTEN_SOCKET, server->listener, MHD_OPTION_CONNECTION_LIMIT, CONNECTIONS_MAX,
-        MHD_OPTION_CONNECTION_TIMEOUT, IDLE_SECONDS, MHD_OPTION_URI_LOG_CALLBACK, on_target, server,
-        MHD_OPTION_NOTIFY_COMPLETED, on_completed, NULL, MHD_OPTION_NOTIFY_CONNECTION,
-        on_connection, server, MHD_OPTION_ARRAY, tls ? secure : plain, MHD_OPTION_END);
+        MHD_OPTION_THREAD_STACK_SIZE, (size_t)THREAD_STACK, MHD_OPTION_CONNECTION_MEMORY_LIMIT,
+        (size_t)CONNECTION_MEMORY, MHD_OPTION_CONNECTION_TIMEOUT, IDLE_SECONDS,
+        MHD_OPTION_URI_LOG_CALLBACK, on_target, server, MHD_OPTION_NOTIFY_COMPLETED, on_completed,
+        NULL, MHD_OPTION_NOTIFY_CONNECTION, on_connection, server, MHD_OPTION_ARRAY,
+        tls ? secure : plain, MHD_OPTION_END);
     if (server->daemon != NULL)
         return server;
     snprintf(why, why_bytes,

@@ -12,6 +12,8 @@ struct http_request;
 const char *http_method(const struct http_request *request);
 const char *http_path(const struct http_request *request); // as sent, without query, not decoded
 const char *http_header(const struct http_request *request, const char *name); // or NULL
+// Whom the request is for: of a target in absolute form its authority, else the Host header.
+const char *http_host(const struct http_request *request);
 // A query parameter, decoded into `out`; false when it is not there. One that does not fit, or
 // whose escapes are wrong, reads as empty.
 bool http_query(const struct http_request *request, const char *key, char *out, size_t bytes);
@@ -41,6 +43,11 @@ struct http_reply {
 void http_reply_header(struct http_reply *reply, const char *name, const char *format, ...)
     __attribute__((format(printf, 3, 4)));
 
+struct http_counts {
+    unsigned open, most, most_of_address; // connections: now, and at most
+    uint64_t accepted, evicted, refused;  // connections
+};
+
 struct http_service {
     void *context;
     size_t max_body;
@@ -48,23 +55,22 @@ struct http_service {
     bool (*admit)(void *context, struct http_request *request, struct http_reply *reply);
     // Called when the body is in, from any thread, several at a time.
     void (*serve)(void *context, struct http_request *request, struct http_reply *reply);
+    // Fills the reply to a head that is not HTTP as it should be, with the status and a sentence.
+    void (*malformed)(void *context, int status, const char *why, struct http_reply *reply);
     // Fills the reply to a body over the limit.
     void (*too_large)(void *context, struct http_reply *reply);
     // Fills the reply on a connection for which there is no place.
-    void (*too_many)(void *context, struct http_reply *reply);
+    void (*too_many)(void *context, const struct http_counts *counts, struct http_reply *reply);
 };
 struct http_address {
     const char *host, *port;        // port "0" picks one
     const char *tls_cert, *tls_key; // files, or NULL
 };
 
-struct http_counts {
-    unsigned open;
-    uint64_t accepted, evicted, refused; // connections
-};
-
-// At most so many connections, and of one address. Beyond that the one is closed that has been
-// without a request for longest; where all are busy, requests are answered with 503.
+#define HTTP_HEADER_BYTES 16384 // of the head of a request; more is a 431
+// At most so many connections, and of one address; fewer where the process may have few files.
+// Beyond that the one is closed that has been without a request for longest; where all are busy,
+// requests are answered with 503.
 #define HTTP_CONNECTIONS 240
 #define HTTP_CONNECTIONS_OF_ADDRESS 192
 

@@ -24,11 +24,12 @@ static const struct {
     {"415", "body is not JSON by its Content-Type"},
     {"421", "foreign Host"},
     {"422", "every fault of the body"},
+    {"431", "head of the request over the limit"},
     {"500", "a damaged file"},
     {"503", "not now; Retry-After says when"},
     {"507", "the disk refuses"},
 };
-static const char everywhere[] = "401 403 405 421 503";
+static const char everywhere[] = "400 401 403 405 421 431 503";
 
 static const struct {
     const char *name, *json;

@@ -205,9 +205,8 @@ static const char *guard_detail(int status) {
 static bool admit(void *context, struct http_request *request, struct http_reply *reply) {
     struct routes *routes = context;
     struct call call = {.routes = routes, .request = request, .reply = reply};
-    int status =
-        guard_verdict(&routes->guard, http_header(request, "Host"), http_header(request, "Origin"),
-                      http_header(request, "Authorization"));
+    int status = guard_verdict(&routes->guard, http_host(request), http_header(request, "Origin"),
+                               http_header(request, "Authorization"));
     if (status != 0) {
         reply_problem(reply, status, NULL, "%s", guard_detail(status));
     } else if (route(&call)) {
@@ -221,6 +220,11 @@ static bool admit(void *context, struct http_request *request, struct http_reply
     return false;
 }
 
+static void malformed(void *context, int status, const char *why, struct http_reply *reply) {
+    reply_problem(reply, status, NULL, "%s", why);
+    routes_tally(context, NULL, status, 0);
+}
+
 static void too_large(void *context, struct http_reply *reply) {
     struct routes *routes = context;
     reply_problem(reply, 413, NULL, "the body is over the limit of %zu bytes",
@@ -228,10 +232,10 @@ static void too_large(void *context, struct http_reply *reply) {
     routes_tally(routes, NULL, reply->status, 0);
 }
 
-static void too_many(void *context, struct http_reply *reply) {
+static void too_many(void *context, const struct http_counts *counts, struct http_reply *reply) {
     reply_problem(reply, 503, NULL,
-                  "there are %d connections already, or %d from your address, and all are busy",
-                  HTTP_CONNECTIONS, HTTP_CONNECTIONS_OF_ADDRESS);
+                  "there are %u connections already, or %u from your address, and all are busy",
+                  counts->most, counts->most_of_address);
     routes_tally(context, NULL, reply->status, 0);
 }
 
@@ -256,6 +260,11 @@ static bool parse_body(struct call *c) {
                       type_is(type, "application/x-www-form-urlencoded")
                           ? "; with curl, use --json in the place of -d"
                           : "");
+        return false;
+    }
+    const char *coding = http_header(c->request, "Content-Encoding");
+    if (bytes > 0 && coding != NULL && strcasecmp(coding, "identity") != 0) {
+        reply_problem(c->reply, 415, NULL, "Content-Encoding must be identity, got %.80s", coding);
         return false;
     }
     struct faults faults = {0};
@@ -294,6 +303,7 @@ struct http_service routes_service(struct routes *routes) {
                                  .max_body = routes->options->max_body,
                                  .admit = admit,
                                  .serve = serve,
+                                 .malformed = malformed,
                                  .too_large = too_large,
                                  .too_many = too_many};
 }

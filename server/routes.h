@@ -9,7 +9,7 @@
 #include "server/runs.h"
 
 #define ROUTES_MAX 48      // routes that are counted
-#define ROUTES_STATUSES 18 // statuses, the last for any other
+#define ROUTES_STATUSES 19 // statuses, the last for any other
 
 struct routes {
     const struct options *options;

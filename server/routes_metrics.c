@@ -12,7 +12,7 @@
 
 // Statuses that the API gives; what is not among them is counted as the last.
 static const int statuses[ROUTES_STATUSES] = {200, 201, 204, 400, 401, 403, 404, 405, 409,
-                                              412, 413, 415, 421, 422, 500, 503, 507, 0};
+                                              412, 413, 415, 421, 422, 431, 500, 503, 507, 0};
 
 void routes_tally(struct routes *routes, const struct route *route, int status, double seconds) {
     size_t row = route != NULL ? (size_t)(route - routes_table) : ROUTES_MAX, column = 0;

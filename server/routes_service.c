@@ -31,6 +31,8 @@ void routes_serve_openapi(struct call *c) {
 void routes_serve_service(struct call *c) {
     const struct options *options = c->routes->options;
     cJSON *json = cJSON_CreateObject(), *limits, *endpoints;
+    struct http_counts counts;
+    http_count(c->routes->http, &counts);
     cJSON_AddStringToObject(json, "name", "fbard");
     cJSON_AddStringToObject(json, "version", FBARD_VERSION);
     cJSON_AddStringToObject(json, "build", "C17, " __VERSION__);
@@ -39,11 +41,12 @@ void routes_serve_service(struct call *c) {
     cJSON_AddNumberToObject(json, "slots", options->slots);
     limits = cJSON_AddObjectToObject(json, "limits");
     reply_add(limits, "body_bytes", (double)options->max_body);
+    reply_add(limits, "header_bytes", HTTP_HEADER_BYTES);
     reply_add(limits, "memory_bytes", (double)options->memory_limit);
     reply_add(limits, "queue", options->queue);
     reply_add(limits, "json_depth", JSON_MAX_DEPTH);
-    reply_add(limits, "connections", HTTP_CONNECTIONS);
-    reply_add(limits, "connections_of_address", HTTP_CONNECTIONS_OF_ADDRESS);
+    reply_add(limits, "connections", counts.most);
+    reply_add(limits, "connections_of_address", counts.most_of_address);
     reply_add(limits, "streams", ROUTES_STREAMS_MAX);
     endpoints = cJSON_AddObjectToObject(json, "endpoints");
     cJSON_AddStringToObject(endpoints, "http", c->routes->http_url);

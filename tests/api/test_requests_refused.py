@@ -5,7 +5,7 @@ import time
 
 import pytest
 from boxes import endless, merged, water
-from fbard import FINAL, is_sanitized, until
+from fbard import FINAL, Reply, check_form, is_sanitized, until
 
 JSON = {"Content-Type": "application/json"}
 
@@ -483,6 +483,45 @@ def test_garbage_on_the_socket_is_survived(daemon):
         answer = raw(daemon, text)
         assert not answer.startswith(b"HTTP/1.1 2"), (text[:40], answer[:100])
         daemon.get("/healthz")
+
+
+HEADS = {
+    "no_host": (b"", 400),
+    "two_hosts": (b"Host: HOST\r\nHost: evil.example\r\n", 400),
+    "own_host_twice": (b"Host: HOST\r\nHost: HOST\r\n", 400),
+    "two_origins": (b"Host: HOST\r\nOrigin: http://HOST\r\nOrigin: http://evil.example\r\n", 400),
+    "two_tokens": (b"Host: HOST\r\nAuthorization: Bearer a\r\nAuthorization: Bearer b\r\n", 400),
+    "blank_in_name": (b"Host: HOST\r\nX-A : b\r\n", 400),
+    "two_lengths": (b"Host: HOST\r\nContent-Length: 2\r\nContent-Length: 40\r\n", 400),
+    "length_and_chunks": (b"Host: HOST\r\nContent-Length: 2\r\nTransfer-Encoding: chunked\r\n", 400),
+    "unknown_coding": (b"Host: HOST\r\nTransfer-Encoding: gzip\r\n", 400),
+    "compressed_body": (b"Host: HOST\r\nContent-Encoding: gzip\r\nContent-Length: 2\r\n", 415),
+    "long_head": (b"Host: HOST\r\n" + b"X-Y: %s\r\n" % (b"z" * 500) * 40, 431),
+}
+
+
+@pytest.mark.parametrize("case", HEADS)
+def test_head_that_two_readers_would_read_differently_is_refused(daemon, case):
+    head, status = HEADS[case]
+    head = b"POST /v1/scenes:validate HTTP/1.1\r\nContent-Type: application/json\r\n" + head + b"\r\n{}"
+    answer = raw(daemon, head.replace(b"HOST", daemon.host.encode()))
+    top, body = answer.split(b"\r\n\r\n", 1)
+    lines = top.decode().split("\r\n")
+    headers = [tuple(line.split(": ", 1)) for line in lines[1:]]
+    reply = check_form(Reply("POST", "/v1/scenes:validate", int(lines[0].split()[1]), headers, body))
+    assert reply.status == status and answer.count(b"HTTP/1.1 ") == 1, answer
+
+
+def test_target_in_absolute_form_is_served_for_its_own_authority(daemon):
+    host = daemon.host.encode()
+    for target, status in ((b"http://" + host + b"/healthz", 200), (b"http://" + host + b"/v1/runs?x", 200),
+                           (b"HTTP://localhost/healthz", 200), (b"http://" + host, 404),
+                           (b"http://evil.example/healthz", 421), (b"http://127.0.0.1@evil.example/healthz", 421),
+                           (b"http:///healthz", 421), (b"ftp://" + host + b"/healthz", 404)):  # fmt: skip
+        answer = raw(daemon, b"GET %s HTTP/1.1\r\nHost: %s\r\n\r\n" % (target, host))
+        assert answer.startswith(b"HTTP/1.1 %d " % status), (target, answer[:100])
+    answer = raw(daemon, b"GET http://%s/healthz HTTP/1.1\r\nHost: evil.example\r\n\r\n" % host)
+    assert answer.startswith(b"HTTP/1.1 200 "), "the target's authority is the one that counts"
 
 
 def test_client_that_hangs_up_in_the_middle_is_survived(daemon, bystander):
