@@ -313,6 +313,18 @@ void journal_close(struct journal *j) {
     free(j);
 }
 
+void journal_rest(struct journal *j) {
+    if (j == NULL)
+        return;
+    pthread_mutex_lock(&j->lock);
+    if (j->events >= 0)
+        close(j->events);
+    if (j->tail >= 0)
+        close(j->tail);
+    j->events = j->tail = -1;
+    pthread_mutex_unlock(&j->lock);
+}
+
 uint64_t journal_cut_bytes(const struct journal *j) {
     return j->cut_bytes;
 }

@@ -45,7 +45,9 @@ struct journal *journal_create(const char *data_dir, const char *id, const char 
 // An existing one: rebuilds the index, cuts a torn tail. NULL on damage before the tail, with its
 // place.
 struct journal *journal_open(const char *data_dir, const char *id, char *why);
-void journal_close(struct journal *journal);                         // leaves the files
+void journal_close(struct journal *journal); // leaves the files
+// Closes its files, of a run that is over: nothing is appended any more, and all can be read still.
+void journal_rest(struct journal *journal);                          // NULL is fine
 int journal_remove(const char *data_dir, const char *id, char *why); // 0 or -1
 
 // What an entry survives: the process (as created), or with `on` a power failure as well: then

@@ -98,15 +98,12 @@ uint64_t journal_n_events(struct journal *j) {
 
 #define EVENT_BLOCK 4096 // longer than almost every line
 
-char *journal_event_next(struct journal *j, uint64_t *offset) {
-    pthread_mutex_lock(&j->lock);
-    uint64_t end = j->event_bytes;
-    pthread_mutex_unlock(&j->lock);
+static char *next_line(int fd, uint64_t end, uint64_t *offset) {
     for (size_t bytes = EVENT_BLOCK; *offset < end; bytes *= 4) {
         if (bytes > end - *offset)
             bytes = (size_t)(end - *offset);
         char *text = malloc(bytes + 1);
-        if (text == NULL || journal_read_at(j->events, text, bytes, *offset) != 0) {
+        if (text == NULL || journal_read_at(fd, text, bytes, *offset) != 0) {
             free(text);
             return NULL;
         }
@@ -124,4 +121,26 @@ char *journal_event_next(struct journal *j, uint64_t *offset) {
             return NULL;
     }
     return NULL;
+}
+
+// The log to read from, the caller's to close; that of the run may be closed meanwhile.
+static int events_reopen(struct journal *j, uint64_t *end) {
+    char path[PATH_MAX];
+    pthread_mutex_lock(&j->lock);
+    *end = j->event_bytes;
+    int fd = j->events >= 0 ? fcntl(j->events, F_DUPFD_CLOEXEC, 0) : -1;
+    pthread_mutex_unlock(&j->lock);
+    if (fd >= 0)
+        return fd;
+    journal_path(j, "events.jsonl", path, sizeof path);
+    return open(path, O_RDONLY | O_CLOEXEC);
+}
+
+char *journal_event_next(struct journal *j, uint64_t *offset) {
+    uint64_t end;
+    int fd = events_reopen(j, &end);
+    char *line = fd >= 0 ? next_line(fd, end, offset) : NULL;
+    if (fd >= 0)
+        close(fd);
+    return line;
 }

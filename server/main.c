@@ -1,9 +1,11 @@
 // fbard: options, log, output thread, runs, HTTP, wait for a signal, stop in reverse order.
 #include <errno.h>
+#include <malloc.h>
 #include <signal.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <sys/resource.h>
 #include <unistd.h>
 
 #include "server/log.h"
@@ -11,6 +13,8 @@
 #include "server/routes.h"
 
 #define EXIT_USAGE 2
+#define OPEN_FILES 65536
+#define ARENAS 8        // of malloc; the usual one a thread takes 64 MiB of address space each
 #define EXIT_RESOURCE 4 // a port, a folder or a file that cannot be had
 
 // Written whole beside it and renamed, so that who waits for the file never reads half of it.
@@ -109,6 +113,16 @@ static void start_with_short_spins(char **argv) {
         execv("/proc/self/exe", argv);            // on failure, go on as we are
 }
 
+// A run that steps holds two files, a connection one or two; the usual soft limit of 1024 is there
+// for the sake of select(), which nothing here uses.
+static void raise_open_files(void) {
+    struct rlimit limit;
+    if (getrlimit(RLIMIT_NOFILE, &limit) != 0 || limit.rlim_cur >= OPEN_FILES)
+        return;
+    limit.rlim_cur = limit.rlim_max < OPEN_FILES ? limit.rlim_max : OPEN_FILES;
+    setrlimit(RLIMIT_NOFILE, &limit);
+}
+
 int main(int argc, char **argv) {
     start_with_short_spins(argv);
     static struct options options;
@@ -132,6 +146,8 @@ int main(int argc, char **argv) {
     signal(SIGPIPE, SIG_IGN);
     signal(SIGXFSZ,
            SIG_IGN); // a file at its limit is an error of that write, not the end of all runs
+    raise_open_files();
+    mallopt(M_ARENA_MAX, ARENAS);
     int lock = journal_lock(options.data_dir, why);
     if (lock < 0) {
         fprintf(stderr, "fbard: --data-dir: %s\n", why);

@@ -479,16 +479,7 @@ static void queue_free(struct item *first) {
     }
 }
 
-void publish_abandon(struct outlet *o) {
-    pthread_mutex_lock(&o->publisher->lock);
-    struct item *first = take_queue(o);
-    pthread_mutex_unlock(&o->publisher->lock);
-    queue_free(first);
-}
-
-void publish_close(struct outlet *o) {
-    if (o == NULL)
-        return;
+void publish_retire(struct outlet *o) {
     struct publisher *p = o->publisher;
     pthread_mutex_lock(&p->lock);
     struct item *first = take_queue(o);
@@ -500,8 +491,15 @@ void publish_close(struct outlet *o) {
     if (p->turn == o)
         p->turn = NULL;
     p->n_awaiting -= o->awaits;
+    o->awaits = false;
     pthread_mutex_unlock(&p->lock);
     queue_free(first);
+}
+
+void publish_close(struct outlet *o) {
+    if (o == NULL)
+        return;
+    publish_retire(o);
     free(o);
 }
 

@@ -49,8 +49,8 @@ void publish_close(struct outlet *outlet); // what is still queued is dropped
 uint64_t publish_subscribers(struct outlet *outlet);
 void publish_await(struct outlet *outlet, bool awaits);
 
-// Drops what could not be written, of a run that is over.
-void publish_abandon(struct outlet *outlet);
+// Of a run that is over: drops what could not be written, and nothing more is taken from it.
+void publish_retire(struct outlet *outlet);
 
 // False also while frames that a recorder has not acknowledged fill the journal's budget.
 bool publish_has_room(struct outlet *outlet);

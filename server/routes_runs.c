@@ -303,6 +303,7 @@ void routes_serve_create(struct call *c) {
         run_release(twin);
         break;
     case RUNS_FULL:
+    case RUNS_MEMORY:
     case RUNS_STOPPED:
         reply_problem(c->reply, 503, NULL, "%s", why);
         break;

@@ -287,6 +287,11 @@ void run_join(struct run *r) {
     r->has_thread = false;
 }
 
+void run_reap(struct run *r) {
+    if (atomic_load(&r->over))
+        run_join(r);
+}
+
 static void run_free(struct run *r) {
     if (r == NULL)
         return;
@@ -383,11 +388,12 @@ static bool begin_thread(struct run *r) {
 }
 
 struct run *run_create(const struct run_host *host, const struct run_definition *definition,
-                       char *why) {
+                       bool *storage, char *why) {
     struct run *r = run_new(host, definition->id);
     char *scene = NULL, *meta = NULL, *event = NULL;
     cJSON *json = NULL;
     snprintf(why, JOURNAL_WHY, "out of memory");
+    *storage = false;
     if (r == NULL)
         return NULL;
     r->scene = definition->scene;
@@ -411,6 +417,7 @@ struct run *run_create(const struct run_host *host, const struct run_definition 
     event = json_print(json, false);
     if (scene == NULL || meta == NULL || event == NULL)
         goto fail;
+    *storage = true;
     r->journal = journal_create(host->data_dir, r->id, scene, meta, why);
     if (r->journal == NULL)
         goto fail;
@@ -423,6 +430,10 @@ struct run *run_create(const struct run_host *host, const struct run_definition 
         made = recorders_put(r->recorders, definition->recorders[k], -1, why) == RECORDERS_OK;
     if (made && definition->start) // here and not in its thread, so that first come is first served
         slots_ask(host->slots, &r->slot, r->sim_bytes);
+    if (made) {
+        *storage = false;
+        snprintf(why, JOURNAL_WHY, "no memory for the run's thread");
+    }
     if (!made || !begin_thread(r)) {
         slots_leave(host->slots, &r->slot);
         slots_unreserve(host->slots, &r->slot);
@@ -634,6 +645,10 @@ struct run *run_restore(const struct run_host *host, const char *id, enum run_re
         restore_final(r, r->history.state, true);
     } else {
         live = restore_live(r, how);
+    }
+    if (!live) {
+        journal_rest(r->journal);
+        series_rest(r->series);
     }
     if (r->meta.name == NULL)
         r->meta.name = strdup("");

@@ -140,9 +140,9 @@ struct run_definition {
     const char *request;       // with it: what the key stands for, at most 16 characters
 };
 // A new run with its folder and its thread. NULL with a sentence in `why`; then the scene is still
-// the caller's.
+// the caller's. `storage`: whether it was the disk that refused, and not memory or threads.
 struct run *run_create(const struct run_host *host, const struct run_definition *definition,
-                       char *why);
+                       bool *storage, char *why);
 // A run that an earlier daemon left. Never fails but for memory: what cannot be read is a run that
 // has failed, with the reason as its error.
 enum run_restore { RUN_RESTORE_CONTINUE, RUN_RESTORE_PAUSE, RUN_RESTORE_KEEP };
@@ -150,6 +150,8 @@ struct run *run_restore(const struct run_host *host, const char *id, enum run_re
 // Ends the thread, with a checkpoint; the files stay. First ask all, then stop each.
 void run_ask_to_stop(struct run *run);
 void run_join(struct run *run);
+// Joins the thread of a run that is over: until then its stack stays. Not by two at once.
+void run_reap(struct run *run);
 // A run is shared: run_release by the last one ends its thread and frees it.
 void run_retain(struct run *run);
 void run_release(struct run *run);

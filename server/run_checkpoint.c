@@ -1,6 +1,7 @@
 // The simulation comes and goes: checkpoints, and the beginning from one. Part of the run's thread
 // (run_loop.c).
 #include <errno.h>
+#include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -120,13 +121,16 @@ static bool load_checkpoint(struct run *r, int which, bool *spoiled) {
 }
 
 static bool sim_create(struct run *r) {
-    struct mpm_error error = {.status = MPM_OK, .particle = -1};
+    struct mpm_error error = {.status = MPM_OK, .particle = -1, .value = NAN};
     mpm_free(r->sim);
     r->sim = NULL;
     if (mpm_create(scene_def(r->scene), &r->sim, &error) == MPM_OK)
         return true;
     r->sim = NULL;
     error.particle = -1;
+    error.value = NAN;
+    if (error.status == MPM_ERR_MEMORY)
+        error.advice = "use larger cells or fewer particles, or run it where there is more memory";
     run_fail_with(r, &error);
     return false;
 }

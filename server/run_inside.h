@@ -45,6 +45,7 @@ struct run {
     atomic_bool knock;  // look at the queue, the slot or the outlet
     atomic_bool stop;   // the daemon ends
     atomic_int viewers; // over HTTP
+    atomic_bool over;   // the thread has nothing more to do: joining it takes no time
 
     // The thread's own.
     struct run_status now; // what `status` is copied from

@@ -560,12 +560,22 @@ void *run_thread(void *argument) {
     if (r->sim != NULL && r->ending == RUN_N_STATES)
         run_checkpoint(r, why);
     close_door(r);
-    publish_flush(r->outlet, run_state_is_final(r->now.state) ? 0 : CHECKPOINT_FLUSH);
-    if (run_state_is_final(r->now.state) && !journal_works(r))
-        publish_abandon(r->outlet);
     slots_leave(r->host->slots, &r->slot);
     mpm_free(r->sim);
     r->sim = NULL;
     slots_unreserve(r->host->slots, &r->slot);
+    if (!run_state_is_final(r->now.state) || journal_works(r))
+        publish_flush(r->outlet, CHECKPOINT_FLUSH);
+    if (run_state_is_final(r->now.state)) { // it may be listed for years: it keeps what is read
+        publish_retire(r->outlet);
+        journal_rest(r->journal);
+        series_rest(r->series);
+        scene_free(r->scene);
+        r->scene = NULL;
+        cJSON_Delete(r->scene_json);
+        cJSON_Delete(r->replay.scene);
+        r->scene_json = r->replay.scene = NULL;
+    }
+    atomic_store(&r->over, true);
     return NULL;
 }

@@ -193,6 +193,8 @@ enum runs_result runs_add(struct runs *s, const struct run_definition *definitio
     struct run_definition named = *definition;
     pthread_mutex_lock(&s->making);
     pthread_mutex_lock(&s->lock);
+    for (size_t k = 0; k < s->count && !s->stopped; k++)
+        run_reap(s->items[k]);
     if (definition->id == NULL)
         make_id(s, definition->name, id);
     else
@@ -213,9 +215,10 @@ enum runs_result runs_add(struct runs *s, const struct run_definition *definitio
     }
     pthread_mutex_unlock(&s->lock);
     if (result == RUNS_CREATED) {
-        *out = run_create(s->host, &named, why);
+        bool storage;
+        *out = run_create(s->host, &named, &storage, why);
         if (*out == NULL)
-            result = RUNS_STORAGE;
+            result = storage ? RUNS_STORAGE : RUNS_MEMORY;
     }
     if (result == RUNS_CREATED) {
         pthread_mutex_lock(&s->lock);

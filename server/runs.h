@@ -20,6 +20,7 @@ enum runs_result {
     RUNS_DUPLICATE,
     RUNS_FULL,
     RUNS_STORAGE,
+    RUNS_MEMORY,
     RUNS_STOPPED,
 };
 // On RUNS_CREATED and RUNS_THERE `out` is retained for the caller; on RUNS_CREATED the scene is the

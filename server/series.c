@@ -18,6 +18,7 @@
 
 #define LOG_MAGIC "FBARPRB1"
 #define TIME_SLACK 1e-9 // relative: times are sums or multiples of dt
+#define VISIT_ROWS 1024 // copied at a time, so that who appends never waits for a reader
 #define PREAMBLE 16     // magic, u32 header bytes, u32 zero
 
 struct series {
@@ -426,12 +427,39 @@ bool series_at_time(struct series *s, size_t column, double time, double *value)
 
 void series_visit(struct series *s, bool all, uint64_t after,
                   void (*visit)(void *context, const struct series_row *row), void *context) {
+    size_t width = row_doubles(s), n;
+    double *some = malloc(VISIT_ROWS * width * sizeof *some);
+    do {
+        pthread_mutex_lock(&s->lock);
+        size_t from = all ? 0 : row_after(s, after);
+        n = some == NULL ? 0 : s->n_rows - from < VISIT_ROWS ? s->n_rows - from : VISIT_ROWS;
+        if (n > 0)
+            memcpy(some, s->rows + from * width, n * width * sizeof *some);
+        pthread_mutex_unlock(&s->lock);
+        for (size_t k = 0; k < n; k++) {
+            const double *row = some + k * width;
+            after = row_step(row);
+            visit(context, &(struct series_row){.step = after, .time = row[1], .values = row + 2});
+        }
+        all = false;
+    } while (n == VISIT_ROWS);
+    free(some);
+}
+
+void series_rest(struct series *s) {
+    if (s == NULL)
+        return;
     pthread_mutex_lock(&s->lock);
-    size_t width = row_doubles(s);
-    for (size_t k = all ? 0 : row_after(s, after); k < s->n_rows; k++) {
-        const double *row = s->rows + k * width;
-        visit(context,
-              &(struct series_row){.step = row_step(row), .time = row[1], .values = row + 2});
+    if (s->fd >= 0)
+        close(s->fd);
+    s->fd = -1;
+    free(s->path);
+    s->path = NULL;
+    double *moved =
+        s->n_rows > 0 ? realloc(s->rows, s->n_rows * row_doubles(s) * sizeof *moved) : NULL;
+    if (moved != NULL) {
+        s->rows = moved;
+        s->capacity = s->n_rows;
     }
     pthread_mutex_unlock(&s->lock);
 }

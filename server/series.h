@@ -43,6 +43,7 @@ enum series_verdict series_append(struct series *series, uint64_t step, double t
 int series_flush(struct series *series);
 int series_sync(struct series *series); // what was flushed survives a power failure; 0 or errno
 size_t series_unsaved(struct series *series); // rows
+void series_rest(struct series *series);      // closes the log, of a run that is over; NULL is fine
 
 size_t series_n_rows(struct series *series);
 // The last row with step <= `step`; false when there is none. `values` has n_columns.
@@ -52,7 +53,7 @@ bool series_at_step(struct series *series, uint64_t step, uint64_t *row_step, do
 cJSON *series_values(struct series *series, uint64_t step);
 // Column value interpolated linearly at `time`; false before the first or after the last row.
 bool series_at_time(struct series *series, size_t column, double time, double *value);
-// Calls `visit` for every row with step > `after` (or every row, when `all`), under the lock:
-// `visit` must not block.
+// Calls `visit` for every row with step > `after` (or every row, when `all`), on copies: who
+// appends is not held up. Nothing where there is no memory for them.
 void series_visit(struct series *series, bool all, uint64_t after,
                   void (*visit)(void *context, const struct series_row *row), void *context);

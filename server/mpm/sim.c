@@ -501,10 +501,11 @@ enum mpm_status mpm_create(const struct mpm_def *def, struct mpm_sim **out, stru
     *out = sim;
     return MPM_OK;
 fail:
-    mpm_fail(err, MPM_ERR_MEMORY, "", "no memory for %zu particles and their grid",
-             sim->n_particles);
     mpm_free(sim);
-    return MPM_ERR_MEMORY;
+    struct mpm_estimate estimate; // what was to be made, not how far it came
+    mpm_estimate(def, &estimate);
+    return mpm_fail(err, MPM_ERR_MEMORY, "", "no memory for %zu particles and their grid: %zu bytes",
+                    estimate.particles, estimate.bytes);
 }
 
 void mpm_free(struct mpm_sim *sim) {

@@ -5,6 +5,7 @@ import json
 import os
 import pathlib
 import re
+import resource
 import signal
 import subprocess
 import time
@@ -115,6 +116,7 @@ class Daemon:
         self.token = None
         self.starts = 0
         self.environment = {}
+        self.limits = {}  # of the process: resource.RLIMIT_... -> value
 
     # ---- The process ----
 
@@ -134,7 +136,7 @@ class Daemon:
             suppressions = pathlib.Path(__file__).with_name("tsan.supp")
             environment = {"TSAN_OPTIONS": f"suppressions={suppressions}", **os.environ, **self.environment}
             self.process = subprocess.Popen(self.command(), stdin=subprocess.DEVNULL, stdout=log, stderr=log,
-                                            env=environment)  # fmt: skip
+                                            env=environment, preexec_fn=self.limit)  # fmt: skip
 
         def ready():
             assert self.process.poll() is None, f"exit {self.process.returncode}: {self.stderr()}"
@@ -145,6 +147,10 @@ class Daemon:
         self.http, self.publish = where["http"], where["publish"]
         self.host = self.http.split("//")[1]
         return self
+
+    def limit(self):
+        for what, value in self.limits.items():
+            resource.setrlimit(what, (value, value))
 
     def stderr(self):
         return self.log.read_text(errors="replace")

@@ -3,6 +3,7 @@ import http.client
 import json
 import os
 import re
+import resource
 import shutil
 import signal
 import socket
@@ -12,7 +13,7 @@ import subprocess
 import time
 
 import pytest
-from boxes import endless, merged, water
+from boxes import big, endless, merged, water
 from fbard import PROGRAM, Daemon, fbar_is_on, is_sanitized, until
 from frames import Frame
 
@@ -130,6 +131,13 @@ def test_missing_or_empty_token_file_is_refused(tmp_path):
     (tmp_path / "empty").write_text("")
     (tmp_path / "empty").chmod(0o600)
     refused(*FREE, "--data-dir", tmp_path / "d", "--token-file", tmp_path / "empty")
+
+
+def test_token_file_that_others_can_read_is_refused(tmp_path):
+    (tmp_path / "token").write_text("secret\n")
+    for mode in (0o644, 0o640, 0o604):
+        (tmp_path / "token").chmod(mode)
+        assert "chmod 600" in refused(*FREE, "--data-dir", tmp_path / "d", "--token-file", tmp_path / "token")
 
 
 def test_token_is_required_where_one_is_given(fresh, tmp_path):
@@ -443,3 +451,68 @@ def test_a_full_disk_is_warned_of_while_it_is_full(tmp_path):
             d.stop()
     finally:
         subprocess.run(["umount", "-l", tmp_path])
+
+
+# ---- Scarcity ----
+
+TINY = water(time={"end": 0.002}, output={"interval": 0.001})
+
+
+def address_space(d):
+    with open(f"/proc/{d.process.pid}/status") as f:
+        return 1024 * int(re.search(r"VmSize:\s+(\d+)", f.read())[1])
+
+
+def test_runs_that_are_over_hold_no_files_and_no_threads(fresh):
+    """More of them than there may be files, now and after a restart; their events can still be read."""
+    d = fresh()
+    d.limits = {resource.RLIMIT_NOFILE: 64}
+    d.start()
+    runs = [f"r{k}" for k in range(70)]
+    for k, run in enumerate(runs):
+        d.create(TINY, id=run)
+        d.wait(run, "completed")
+        if k == 20:
+            until(lambda: d.descriptors() < 20)
+            before = address_space(d)
+    assert address_space(d) - before < 20e6 or is_sanitized(), "a thread's stack takes 8 MB"
+    d.stop()
+    d.start()
+    assert d.descriptors() < 20
+    for run in runs:
+        now = d.run(run)
+        assert now["state"] == "completed" and now["journal"]["frames"] == 3, now
+    log = d.ask("GET", "/v1/runs/r0/events", headers={"Last-Event-ID": "0"}).body.decode()
+    assert log.startswith("id: 1\n") and '"state":"completed"' in log
+
+
+def test_few_descriptors_are_no_way_to_lock_others_out(fresh):
+    d = fresh()
+    d.limits = {resource.RLIMIT_NOFILE: 64}
+    d.start()
+    assert d.get("/v1")["limits"]["connections"] <= 16
+    run = d.create(endless())["id"]
+    host, port = d.host.split(":")
+    idle = [socket.create_connection((host, int(port)), timeout=20) for _ in range(100)]
+    try:
+        for _ in range(10):
+            began = time.monotonic()
+            d.act(run, "checkpoint")
+            assert time.monotonic() - began < (5 if is_sanitized() else 1)
+    finally:
+        for s in idle:
+            s.close()
+    assert not d.run(run)["warnings"]
+
+
+@pytest.mark.skipif(is_sanitized(), reason="sanitizers take terabytes of address space")
+def test_run_without_memory_fails_and_says_how_much_it_wanted(fresh):
+    d = fresh("--memory-limit", "1000000000000")
+    d.limits = {resource.RLIMIT_AS: 400_000_000}
+    d.start()
+    d.create(big(particles_per_cell=1024, cell=0.025), id="big")
+    error = d.wait("big", "failed")["error"]
+    assert error["kind"] == "memory" and error["value"] is None and error["advice"], error
+    assert str(1600 * 1024) in error["detail"], error
+    d.create(TINY, id="small")
+    d.wait("small", "completed")

@@ -75,7 +75,8 @@ static struct scene *small_dam(const char *more) {
 static struct run *begin(const char *id, bool start, const char *more) {
     struct run_definition definition = {
         .id = id, .name = "dam-break", .scene = small_dam(more), .start = start};
-    struct run *run = run_create(&host, &definition, why);
+    bool storage;
+    struct run *run = run_create(&host, &definition, &storage, why);
     assert_non_null(run);
     return run;
 }
