@@ -9,6 +9,7 @@
 #include <unistd.h>
 
 #include "server/log.h"
+#include "server/notify.h"
 #include "server/options.h"
 #include "server/routes.h"
 
@@ -84,7 +85,9 @@ static int run_daemon(const struct options *options, const sigset_t *signals) {
         log_info("ready", "http=%s publish=%s data_dir=\"%s\" threads=%d slots=%d isa=%s",
                  routes.http_url, routes.publish_url, options->data_dir, options->threads,
                  options->slots, mpm_isa_name(mpm_isa_in_use(options->isa)));
+        notify_send("READY=1");
         sigwait(signals, &received);
+        notify_send("STOPPING=1");
         log_info("ending", "signal=%d", received);
         status = 0;
     }
