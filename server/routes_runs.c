@@ -7,6 +7,7 @@
 
 #include "server/history.h"
 #include "server/routes_inside.h"
+#include "server/scene_fault.h"
 
 // ---- Run objects ------------------------------------------------------------------------------
 
@@ -137,11 +138,32 @@ static cJSON *run_json(struct run *run) {
     return json;
 }
 
+// A 404 that says what was perhaps meant: an id that is near, or else the newest one that begins
+// with the word (ids that the daemon makes up begin with the scene's name).
+static void reply_no_run(struct call *c) {
+    const char *word = c->names[0];
+    struct scene_suggestion s = {.word = word};
+    size_t count;
+    struct run **all = runs_all(c->routes->runs, &count);
+    for (size_t k = 0; k < count; k++)
+        scene_suggest(&s, run_id(all[k]));
+    for (size_t k = count; s.best == NULL && k-- > 0;)
+        if (word[0] != '\0' && strncmp(run_id(all[k]), word, strlen(word)) == 0)
+            s.best = run_id(all[k]);
+    if (s.best != NULL)
+        reply_problem(c->reply, 404, NULL, "there is no run %.80s; did you mean %s?", word, s.best);
+    else
+        reply_problem(c->reply, 404, NULL, "there is no run %.80s", word);
+    for (size_t k = 0; k < count; k++)
+        run_release(all[k]);
+    free(all);
+}
+
 // The run that the path names, retained; NULL when the reply is a 404.
 struct run *routes_run_of(struct call *c) {
     struct run *run = runs_find(c->routes->runs, c->names[0]);
     if (run == NULL)
-        reply_problem(c->reply, 404, NULL, "there is no run %.80s", c->names[0]);
+        reply_no_run(c);
     return run;
 }
 
@@ -173,7 +195,7 @@ void routes_serve_delete(struct call *c) {
         c->reply->status = 204;
         break;
     case RUNS_MISSING:
-        reply_problem(c->reply, 404, NULL, "there is no run %.80s", c->names[0]);
+        reply_no_run(c);
         break;
     case RUNS_ALIVE:
         reply_problem(c->reply, 409, NULL, "run %.80s is %s: cancel it first", c->names[0],

@@ -80,14 +80,6 @@ void routes_serve_scenes(struct call *c) {
     reply_json(c->reply, 200, json);
 }
 
-void routes_serve_scene(struct call *c) {
-    cJSON *scene = scene_builtin(c->names[0]);
-    if (scene == NULL)
-        reply_problem(c->reply, 404, NULL, "there is no built-in scene %.80s", c->names[0]);
-    else
-        reply_json(c->reply, 200, scene);
-}
-
 // ---- Scenes in a body -------------------------------------------------------------------------
 
 // Adds the faults of a scene, with their pointers below `prefix` of the body.
@@ -143,26 +135,28 @@ void routes_unknown_keys(const cJSON *body, const char *known, struct faults *fa
     }
 }
 
-// The name that shares most letters in order; to be told what was meant is worth this much.
+// What was perhaps meant by the name of a scene that there is not: a near word, or else the first
+// name that holds it ("footing").
 static const char *nearest_scene(const char *name) {
-    const char *best = NULL;
-    size_t best_score = 0;
-    for (size_t k = 0; k < scene_builtin_count(); k++) {
-        const char *candidate = scene_builtin_name(k), *at = candidate;
-        size_t score = 0;
-        for (const char *c = name; *c != '\0'; c++) {
-            const char *hit = strchr(at, *c);
-            if (hit != NULL) {
-                score++;
-                at = hit + 1;
-            }
-        }
-        if (2 * score > strlen(candidate) && score > best_score) {
-            best = candidate;
-            best_score = score;
-        }
-    }
-    return best;
+    struct scene_suggestion s = {.word = name};
+    for (size_t k = 0; k < scene_builtin_count(); k++)
+        scene_suggest(&s, scene_builtin_name(k));
+    for (size_t k = 0; s.best == NULL && strlen(name) > 2 && k < scene_builtin_count(); k++)
+        if (strstr(scene_builtin_name(k), name) != NULL)
+            s.best = scene_builtin_name(k);
+    return s.best;
+}
+
+void routes_serve_scene(struct call *c) {
+    const char *name = c->names[0], *near = nearest_scene(name);
+    cJSON *scene = scene_builtin(name);
+    if (scene != NULL)
+        reply_json(c->reply, 200, scene);
+    else if (near != NULL)
+        reply_problem(c->reply, 404, NULL, "there is no built-in scene %.80s; did you mean %s?",
+                      name, near);
+    else
+        reply_problem(c->reply, 404, NULL, "there is no built-in scene %.80s", name);
 }
 
 static cJSON *builtin_named(const char *name, struct faults *faults) {
