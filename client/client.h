@@ -34,10 +34,12 @@ struct option_spec {
     const char *doc;
 };
 
-// One subcommand: the table in main.c drives parsing and help alike.
+// One subcommand: its table drives parsing, help, completion and the manual page alike. What stands
+// for a value ("RUN", "SCENE", "FILE.h5", ...) also says how it is completed (complete.c).
 struct command {
     const char *name, *positionals, *summary;
-    const char *doc; // more lines for `fbar help NAME`, or NULL
+    const char *doc;      // more lines for `fbar help NAME`, or NULL
+    const char *examples; // lines of commands, or NULL
     int least, most; // number of positionals; most -1: any
     const struct option_spec *options;
     // Returns an exit code.
@@ -46,4 +48,4 @@ struct command {
 
 extern const struct command cmd_run, cmd_scenes, cmd_validate, cmd_list, cmd_show, cmd_start,
     cmd_pause, cmd_resume, cmd_step, cmd_cancel, cmd_set, cmd_watch, cmd_record, cmd_probes,
-    cmd_info, cmd_plot, cmd_recover, cmd_delete, cmd_keygen;
+    cmd_info, cmd_plot, cmd_recover, cmd_delete, cmd_keygen, cmd_completion;

@@ -80,7 +80,7 @@ static int delete (struct client *client, const struct arguments *arguments) {
         return code;
     request_reply_free(&reply);
     if (client->json)
-        puts("{\"deleted\":true}");
+        report_json_text("{\"deleted\": true}");
     return CLIENT_DONE;
 }
 

@@ -1,4 +1,5 @@
 // fbar keygen: keys for an encrypted ZeroMQ socket, of a daemon and of those who may subscribe.
+#include <cjson/cJSON.h>
 #include <errno.h>
 #include <fcntl.h>
 #include <stdio.h>
@@ -8,6 +9,7 @@
 
 #include "client/arguments.h"
 #include "client/client.h"
+#include "client/report.h"
 #include "client/subscribe.h"
 #include "client/terminal.h"
 
@@ -78,7 +80,6 @@ static int run(struct client *client, const struct arguments *arguments) {
     const char *name = arguments->n_positionals > 1 ? arguments->positionals[1] : "client";
     char path[KEYGEN_PATH], server[SUBSCRIBE_KEY + 1], public[SUBSCRIBE_KEY], secret[SUBSCRIBE_KEY];
     char text[4 * SUBSCRIBE_KEY + 200];
-    (void)client;
     if (!name_valid(name)) {
         terminal_error("NAME must be 1 to %d of A-Z a-z 0-9 . _ -, not beginning with a dot, got "
                        "\"%s\"",
@@ -107,7 +108,15 @@ static int run(struct client *client, const struct arguments *arguments) {
     snprintf(path, sizeof path, "%s/clients/%s.public", folder, name);
     if (!write_new(path, 0644, text))
         return CLIENT_IO;
-    printf("%s/%s.curve\n", folder, name);
+    snprintf(path, sizeof path, "%s/%s.curve", folder, name);
+    if (client->json) {
+        cJSON *answer = cJSON_CreateObject();
+        cJSON_AddStringToObject(answer, "file", path);
+        report_json(answer);
+        cJSON_Delete(answer);
+    } else {
+        puts(path);
+    }
     return CLIENT_DONE;
 }
 

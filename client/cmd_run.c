@@ -26,17 +26,6 @@ static const struct option_spec options[] = {
     {NULL, 0, NULL, NULL},
 };
 
-static bool answers(struct request *requests) {
-    struct reply reply;
-    char why[256];
-    const struct request_spec spec = {.method = "GET", .path = "/healthz", .timeout_ms = 2000};
-    if (request_send(requests, &spec, &reply, why, sizeof why) != 0)
-        return false;
-    const bool good = reply.status == 200;
-    request_reply_free(&reply);
-    return good;
-}
-
 static char *request_body(const struct arguments *arguments) {
     char *scene = overrides_scene(arguments->positionals[0]), *body = NULL, *rest = NULL;
     cJSON *patch = cJSON_CreateObject(), *members = cJSON_CreateObject();
@@ -169,21 +158,12 @@ static int run(struct client *client, const struct arguments *arguments) {
     char *body = request_body(arguments);
     if (!body)
         return CLIENT_USAGE;
-    int code;
-    if (client->url_given || answers(client->requests)) {
-        code = create_and_follow(client, arguments, body, false);
-    } else {
-        struct daemon daemon;
-        struct client own = *client;
-        code = interrupt_count() ? CLIENT_INTERRUPTED : CLIENT_UNREACHABLE;
-        if (daemon_start(&daemon) == 0) {
-            own.url = daemon.url;
-            own.requests = request_create(daemon.url, NULL);
-            if (own.requests)
-                code = create_and_follow(&own, arguments, body, true);
-            request_free(own.requests);
-            daemon_stop(&daemon);
-        }
+    struct daemon daemon;
+    struct client own;
+    int code = daemon_reach(client, &daemon, &own);
+    if (code == CLIENT_DONE) {
+        code = create_and_follow(&own, arguments, body, daemon_private(&daemon));
+        daemon_leave(&daemon, &own);
     }
     free(body);
     return code;

@@ -5,6 +5,7 @@
 
 #include "client/arguments.h"
 #include "client/client.h"
+#include "client/daemon.h"
 #include "client/report.h"
 #include "client/request.h"
 
@@ -13,7 +14,7 @@ static const char *text(const cJSON *object, const char *key) {
     return value ? value : "";
 }
 
-static int run(struct client *client, const struct arguments *arguments) {
+static int list(struct client *client, const struct arguments *arguments) {
     cJSON *answer;
     char *path = arguments->n_positionals
                      ? request_path("/v1/scenes/", arguments->positionals[0], "")
@@ -32,6 +33,17 @@ static int run(struct client *client, const struct arguments *arguments) {
     }
     cJSON_Delete(answer);
     return CLIENT_DONE;
+}
+
+static int run(struct client *client, const struct arguments *arguments) {
+    struct daemon daemon;
+    struct client own;
+    int code = daemon_reach(client, &daemon, &own);
+    if (code == CLIENT_DONE) {
+        code = list(&own, arguments);
+        daemon_leave(&daemon, &own);
+    }
+    return code;
 }
 
 const struct command cmd_scenes = {

@@ -5,6 +5,7 @@
 
 #include "client/arguments.h"
 #include "client/client.h"
+#include "client/daemon.h"
 #include "client/overrides.h"
 #include "client/report.h"
 #include "client/request.h"
@@ -43,7 +44,7 @@ static void print_estimate(const cJSON *answer) {
         printf("%-12s %.6g\n", item->string, item->valuedouble);
 }
 
-static int run(struct client *client, const struct arguments *arguments) {
+static int validate(struct client *client, const struct arguments *arguments) {
     char *scene, *body = NULL;
     cJSON *patch = cJSON_CreateObject(), *answer = NULL;
     const char *word;
@@ -65,6 +66,17 @@ static int run(struct client *client, const struct arguments *arguments) {
     free(body);
     cJSON_Delete(patch);
     cJSON_Delete(answer);
+    return code;
+}
+
+static int run(struct client *client, const struct arguments *arguments) {
+    struct daemon daemon;
+    struct client own;
+    int code = daemon_reach(client, &daemon, &own);
+    if (code == CLIENT_DONE) {
+        code = validate(&own, arguments);
+        daemon_leave(&daemon, &own);
+    }
     return code;
 }
 

@@ -27,7 +27,7 @@ static int run(struct client *client, const struct arguments *arguments) {
             until_shown = progress_interval();
             if (client->json) { // a line a look, for pipes
                 char *line = cJSON_PrintUnformatted(run);
-                puts(line ? line : "null");
+                report_json_text(line ? line : "null");
                 fflush(stdout);
                 free(line);
             } else {

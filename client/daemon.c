@@ -17,6 +17,7 @@
 #include <unistd.h>
 
 #include "client/interrupt.h"
+#include "client/request.h"
 #include "client/terminal.h"
 
 #define START_S 30
@@ -154,4 +155,44 @@ void daemon_stop(struct daemon *daemon) {
     if (daemon->folder[0])
         nftw(daemon->folder, remove_one, 16, FTW_DEPTH | FTW_PHYS);
     *daemon = (struct daemon){0};
+}
+
+bool daemon_private(const struct daemon *daemon) {
+    return daemon->pid > 0;
+}
+
+static bool answers(struct request *requests) {
+    struct reply reply;
+    char why[256];
+    const struct request_spec spec = {.method = "GET", .path = "/healthz", .timeout_ms = 2000};
+    if (request_send(requests, &spec, &reply, why, sizeof why) != 0)
+        return false;
+    const bool good = reply.status == 200;
+    request_reply_free(&reply);
+    return good;
+}
+
+int daemon_reach(const struct client *client, struct daemon *daemon, struct client *out) {
+    *daemon = (struct daemon){0};
+    *out = *client;
+    if (client->url_given || answers(client->requests))
+        return CLIENT_DONE;
+    if (interrupt_count())
+        return CLIENT_INTERRUPTED;
+    if (daemon_start(daemon) != 0)
+        return interrupt_count() ? CLIENT_INTERRUPTED : CLIENT_UNREACHABLE;
+    out->url = daemon->url;
+    out->token_file = NULL;
+    out->requests = request_create(daemon->url, NULL);
+    if (out->requests)
+        return CLIENT_DONE;
+    daemon_stop(daemon);
+    return CLIENT_IO;
+}
+
+void daemon_leave(struct daemon *daemon, struct client *out) {
+    if (!daemon_private(daemon))
+        return;
+    request_free(out->requests);
+    daemon_stop(daemon);
 }

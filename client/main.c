@@ -1,4 +1,4 @@
-// fbar, the command-line client of fbard. The table below is the list of commands and the help.
+// fbar, the command-line client of fbard: what is asked for, and to whom it goes.
 #include <malloc.h>
 #include <signal.h>
 #include <stdio.h>
@@ -7,72 +7,36 @@
 
 #include "client/arguments.h"
 #include "client/client.h"
+#include "client/commands.h"
+#include "client/complete.h"
+#include "client/help.h"
 #include "client/interrupt.h"
+#include "client/report.h"
 #include "client/request.h"
 #include "client/terminal.h"
 
-static const struct command *const commands[] = {
-    &cmd_run,    &cmd_scenes, &cmd_validate, &cmd_list,   &cmd_show,   &cmd_start,  &cmd_pause,
-    &cmd_resume, &cmd_step,   &cmd_cancel,   &cmd_set,    &cmd_watch,  &cmd_record, &cmd_probes,
-    &cmd_info,   &cmd_plot,   &cmd_recover,  &cmd_delete, &cmd_keygen,
-};
-#define N_COMMANDS (sizeof commands / sizeof *commands)
-
-static void print_options(const struct option_spec *options) {
-    for (; options && options->name; options++) {
-        char left[64];
-        const char letter[] = {'-', options->letter, ',', ' ', '\0'};
-        snprintf(left, sizeof left, "%s--%s%s%s", options->letter ? letter : "    ", options->name,
-                 options->value ? " " : "", options->value ? options->value : "");
-        printf("  %-24s %s\n", left, options->doc);
-    }
-}
-
-static void print_help(void) {
-    puts("fbar: runs material-point simulations on an fbard daemon, and records them\n\n"
-         "usage: fbar [--url URL] [--token-file FILE] [--curve-file FILE] [--json] COMMAND ...\n");
-    for (size_t i = 0; i < N_COMMANDS; i++) {
-        char left[64];
-        snprintf(left, sizeof left, "%s %s", commands[i]->name, commands[i]->positionals);
-        printf("  %-24s %s\n", left, commands[i]->summary);
-    }
-    puts("");
-    print_options(arguments_global);
-    puts("\nexamples:\n"
-         "  fbar run dam-break -o dam.h5 --set fbar=false\n"
-         "  fbar plot dam.h5 --field mean_stress --time 0.4 -o dam.png\n"
-         "  fbar plot off.h5 on.h5 --time 0.4,1,2 -o both.png\n"
-         "\n"
-         "exit codes: 0 done, 1 the run failed, 2 usage or invalid scene, 3 cannot reach the "
-         "daemon,\n"
-         "4 I/O, 130 interrupted. `fbar COMMAND --help` tells more.");
-}
-
-static void print_command_help(const struct command *command) {
-    printf("usage: fbar %s %s\n\n%s\n", command->name, command->positionals, command->summary);
-    if (command->doc)
-        printf("\n%s\n", command->doc);
-    puts("");
-    print_options(command->options);
-    print_options(arguments_global);
-}
-
-static const struct command *find_command(const char *name) {
-    const char *names[N_COMMANDS + 1] = {NULL};
-    for (size_t i = 0; i < N_COMMANDS; i++) {
-        names[i] = commands[i]->name;
-        if (strcmp(commands[i]->name, name) == 0)
-            return commands[i];
-    }
-    const char *closest = arguments_closest(name, names);
-    terminal_error("%s: unknown command%s%s%s; `fbar --help` lists them", name,
-                   closest ? "; did you mean " : "", closest ? closest : "", closest ? "?" : "");
-    return NULL;
-}
-
-static int print_version(void) {
-    puts("fbar " FBARD_VERSION);
+static int print_version(bool json) {
+    puts(json ? "{\"version\": \"" FBARD_VERSION "\"}" : "fbar " FBARD_VERSION);
     return CLIENT_DONE;
+}
+
+// With --json there is an answer in any case: what went wrong, where nothing else was printed.
+static void print_faults(int code) {
+    cJSON *answer = cJSON_CreateObject();
+    cJSON_AddNumberToObject(answer, "exit_code", code);
+    cJSON *list = cJSON_AddArrayToObject(answer, "faults");
+    for (int i = 0; terminal_fault(i); i++)
+        cJSON_AddItemToArray(list, cJSON_CreateString(terminal_fault(i)));
+    report_json(answer);
+    cJSON_Delete(answer);
+}
+
+// Of a command line that could not be read to its end.
+static bool wants_json(int argc, char **argv) {
+    for (int i = 1; i < argc; i++)
+        if (strcmp(argv[i], "--json") == 0)
+            return true;
+    return false;
 }
 
 static const char *first_of(const char *a, const char *b) {
@@ -107,6 +71,8 @@ static int run_command(const struct command *command, const struct arguments *gl
         return CLIENT_IO;
     const int code = command->run(&client, arguments);
     request_free(client.requests);
+    if (client.json && code != CLIENT_DONE && !report_printed())
+        print_faults(code);
     if (fflush(stdout) != 0 || ferror(stdout)) {
         terminal_error("cannot write to standard output");
         return CLIENT_IO;
@@ -123,32 +89,40 @@ int main(int argc, char **argv) {
     mallopt(M_MMAP_THRESHOLD, 32 << 20);
     mallopt(M_TRIM_THRESHOLD, 128 << 20);
     interrupt_catch();
+    if (argc > 1 && strcmp(argv[1], "__complete") == 0) // asked by the shells' scripts
+        return complete_print(argc - 2, argv + 2);
+    if (argc > 1 && strcmp(argv[1], "__manual") == 0) { // asked by the Makefile
+        help_print_manual();
+        return CLIENT_DONE;
+    }
     const int used = arguments_parse(argc - 1, argv + 1, NULL, &global);
     if (used < 0)
         return CLIENT_USAGE;
     argc -= used + 1;
     argv += used + 1;
-    if (arguments_flag(&global, "version"))
-        return print_version();
+    const bool json = arguments_flag(&global, "json");
+    if (arguments_flag(&global, "version") || (argc > 0 && strcmp(argv[0], "version") == 0))
+        return print_version(json);
     if (argc == 0 || strcmp(argv[0], "help") == 0) {
-        const struct command *command = argc > 1 ? find_command(argv[1]) : NULL;
+        const struct command *command = argc > 1 ? commands_expect(argv[1]) : NULL;
         if (argc > 1 && !command)
             return CLIENT_USAGE;
         if (command)
-            print_command_help(command);
+            help_print_command(command);
         else
-            print_help();
+            help_print();
         return argc > 0 || arguments_flag(&global, "help") ? CLIENT_DONE : CLIENT_USAGE;
     }
-    if (strcmp(argv[0], "version") == 0)
-        return print_version();
-    const struct command *command = find_command(argv[0]);
-    if (!command || arguments_parse(argc - 1, argv + 1, command, &arguments) < 0)
+    const struct command *command = commands_expect(argv[0]);
+    if (!command || arguments_parse(argc - 1, argv + 1, command, &arguments) < 0) {
+        if (json || (command && wants_json(argc, argv)))
+            print_faults(CLIENT_USAGE);
         return CLIENT_USAGE;
+    }
     if (arguments_flag(&arguments, "version"))
-        return print_version();
+        return print_version(json || arguments_flag(&arguments, "json"));
     if (arguments_flag(&arguments, "help") || arguments_flag(&global, "help")) {
-        print_command_help(command);
+        help_print_command(command);
         return CLIENT_DONE;
     }
     return run_command(command, &global, &arguments);

@@ -8,6 +8,7 @@
 #include "client/recorder_inside.h"
 
 #include <errno.h>
+#include <fcntl.h>
 #include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -298,13 +299,30 @@ static int exit_code(enum recorder_outcome outcome) {
     return CLIENT_IO;
 }
 
+// Whether the log can be made there: better now than after the run was created.
+static int check_place(const char *file) {
+    char *name = assemble_log_name(file);
+    const bool there = name && access(name, F_OK) == 0;
+    const int fd = name ? open(name, O_RDWR | O_CREAT | O_CLOEXEC, 0666) : -1;
+    const int error = errno;
+    if (fd >= 0)
+        close(fd);
+    if (fd >= 0 && !there)
+        unlink(name);
+    free(name);
+    if (fd >= 0)
+        return CLIENT_DONE;
+    terminal_error("%s: %s; choose another -o", file, strerror(error));
+    return CLIENT_IO;
+}
+
 int recorder_check_file(const char *file, const char *run) {
     char why[512];
     bool foreign;
     struct store_file *h5 = store_open(file, &foreign, why, sizeof why);
+    if (!h5 && access(file, F_OK) != 0)
+        return check_place(file);
     if (!h5) {
-        if (access(file, F_OK) != 0)
-            return CLIENT_DONE;
         terminal_error("%s; choose another -o, or move it away", why);
         return CLIENT_IO;
     }

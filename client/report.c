@@ -10,10 +10,21 @@
 #include "client/progress.h"
 #include "client/terminal.h"
 
+static bool printed;
+
 void report_json(const cJSON *value) {
     char *text = cJSON_Print(value);
-    puts(text ? text : "null");
+    report_json_text(text ? text : "null");
     free(text);
+}
+
+void report_json_text(const char *text) {
+    puts(text);
+    printed = true;
+}
+
+bool report_printed(void) {
+    return printed;
 }
 
 static const cJSON *member(const cJSON *object, const char *key) {
@@ -46,6 +57,21 @@ static const char *scene_word(const cJSON *run) {
     return *title ? title : "";
 }
 
+// The state in its colour, padded to `width` where that is not 0.
+static void print_state(const cJSON *run, int width) {
+    static const struct {
+        const char *state;
+        enum terminal_style style;
+    } styles[] = {{"running", TERMINAL_BUSY}, {"completed", TERMINAL_GOOD}, {"failed", TERMINAL_BAD},
+                  {"waiting", TERMINAL_WARN}, {"paused", TERMINAL_WARN},    {"cancelled", TERMINAL_WARN}};
+    const char *state = text(run, "state"), *paint = "";
+    for (size_t i = 0; i < sizeof styles / sizeof *styles; i++)
+        if (strcmp(styles[i].state, state) == 0)
+            paint = terminal_paint(stdout, styles[i].style);
+    printf("%s%s%s%*s", paint, state, *paint ? terminal_paint(stdout, TERMINAL_PLAIN) : "",
+           width > (int)strlen(state) ? width - (int)strlen(state) : 0, "");
+}
+
 static void print_value(const cJSON *value) {
     if (cJSON_IsNumber(value)) {
         printf("%.6g", value->valuedouble);
@@ -70,27 +96,41 @@ static void print_value(const cJSON *value) {
 void report_runs(const cJSON *runs) {
     const cJSON *run;
     if (cJSON_GetArraySize(runs) == 0) {
-        puts("no runs");
+        puts("no runs; `fbar run SCENE` makes one");
         return;
     }
-    printf("%-24s %-10s %8s %10s %10s %10s %-6s %s\n", "RUN", "STATE", "DONE", "STEP", "TIME / s",
-           "PARTICLES", "F-BAR", "SCENE");
-    cJSON_ArrayForEach(run, runs)
-        printf("%-24s %-10s %6.1f %% %10.0f %10.4g %10.0f %-6s %s\n", text(run, "id"),
-               text(run, "state"), 100 * number(run, "progress"), number(run, "step"),
-               number(run, "time"), number(run, "particles"), fbar_word(run), scene_word(run));
+    printf("%s%-26s %-10s %7s %10s %10s %10s %-8s %s%s\n", terminal_paint(stdout, TERMINAL_BOLD),
+           "RUN", "STATE", "DONE", "STEP", "TIME / s", "PARTICLES", "F-BAR", "SCENE",
+           terminal_paint(stdout, TERMINAL_PLAIN));
+    cJSON_ArrayForEach(run, runs) {
+        printf("%-26s ", text(run, "id"));
+        print_state(run, 10);
+        printf(" %5.1f %% %10.0f %10.4g %10.0f %-8s %s\n", 100 * number(run, "progress"),
+               number(run, "step"), number(run, "time"), number(run, "particles"), fbar_word(run),
+               scene_word(run));
+    }
 }
 
 static void print_references(const cJSON *accuracy) {
     const cJSON *entry;
     cJSON_ArrayForEach(entry, accuracy) {
-        printf("  %s: ", text(entry, "probe"));
-        print_value(member(entry, "value"));
-        fputs(", reference ", stdout);
-        print_value(member(entry, "reference"));
-        if (cJSON_IsNumber(member(entry, "relative_error")))
+        const cJSON *at = member(entry, "at"), *value = member(entry, "value");
+        const double reference = number(entry, "reference");
+        printf("  %s", text(entry, "probe"));
+        if (*text(entry, "component"))
+            printf(".%s", text(entry, "component"));
+        if (cJSON_IsNumber(at))
+            printf(" at t = %.4g s", at->valuedouble);
+        fputs(": ", stdout);
+        if (cJSON_IsNull(value))
+            fputs("not reached", stdout);
+        else
+            print_value(value);
+        printf(", reference %.6g", reference);
+        // Of a reference of 0 the value itself is the error.
+        if (cJSON_IsNumber(member(entry, "relative_error")) && reference != 0)
             printf(" (%+.2f %%)", 100 * number(entry, "relative_error"));
-        printf("  %s\n", text(entry, "source"));
+        printf("  [%s]\n", text(entry, "source"));
     }
 }
 
@@ -115,8 +155,10 @@ void report_run(const cJSON *run) {
     progress_duration(number(performance, "wall_s"), wall, sizeof wall);
     printf("run        %s (%s)\n", text(run, "id"), text(run, "created"));
     printf("scene      %s\n", scene_word(run));
-    printf("state      %s, %.1f %%%s%s\n", text(run, "state"), 100 * number(run, "progress"),
-           progress_over(run) ? "" : ", ETA ", progress_over(run) ? "" : eta);
+    fputs("state      ", stdout);
+    print_state(run, 0);
+    const bool ends = strcmp(text(run, "state"), "running") == 0;
+    printf(", %.1f %%%s%s\n", 100 * number(run, "progress"), ends ? ", ETA " : "", ends ? eta : "");
     printf("step       %.0f, t = %.6g s of %.6g s, dt = %.4g s\n", number(run, "step"),
            number(run, "time"), number(run, "end_time"), number(run, "dt"));
     printf("particles  %.0f, F-bar %s\n", number(run, "particles"), fbar_word(run));
@@ -169,9 +211,11 @@ int report_outcome(const cJSON *run) {
     char wall[32];
     const cJSON *performance = member(run, "performance");
     progress_duration(number(performance, "wall_s"), wall, sizeof wall);
-    printf("%s %s: %.0f particles, %.0f steps, t = %.4g s in %s, %.3g million particle-steps/s\n",
-           text(run, "id"), text(run, "state"), number(run, "particles"), number(run, "step"),
-           number(run, "time"), wall, 1e-6 * number(performance, "particle_steps_per_s"));
+    printf("%s ", text(run, "id"));
+    print_state(run, 0);
+    printf(": %.0f particles, %.0f steps, t = %.4g s in %s, %.3g million particle-steps/s\n",
+           number(run, "particles"), number(run, "step"), number(run, "time"), wall,
+           1e-6 * number(performance, "particle_steps_per_s"));
     print_references(member(run, "accuracy"));
     fflush(stdout);
     if (cJSON_IsObject(member(run, "error")))

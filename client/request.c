@@ -8,6 +8,7 @@
 #include <string.h>
 
 #include "client/interrupt.h"
+#include "client/report.h"
 #include "client/terminal.h"
 
 #define CONNECT_TIMEOUT_MS 5000L
@@ -189,12 +190,17 @@ int request_complain(const struct reply *reply) {
 int request_expect(struct client *client, const struct request_spec *spec, struct reply *out) {
     char why[512];
     if (request_send(client->requests, spec, out, why, sizeof why) != 0) {
-        terminal_error("cannot reach the daemon at %s: %s", client->url, why);
+        terminal_error("cannot reach the daemon at %s: %s; start one with `fbard`%s", client->url, why,
+                       client->url_given ? ", or name another with --url" : "");
         return interrupt_count() ? CLIENT_INTERRUPTED : CLIENT_UNREACHABLE;
     }
     if (out->status >= 200 && out->status < 300)
         return CLIENT_DONE;
     const int code = request_complain(out);
+    cJSON *problem = client->json ? cJSON_Parse(out->body) : NULL;
+    if (problem)
+        report_json(problem);
+    cJSON_Delete(problem);
     request_reply_free(out);
     return code;
 }

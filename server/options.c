@@ -142,6 +142,7 @@ static bool parse_resume(const char *text, enum options_resume *out) {
     X(MAX_BODY, "--max-body", "BYTES", "largest request body (8M)")                                \
     X(INSECURE, "--insecure", NULL, "allow addresses beyond loopback without token and TLS")       \
     X(HELP, "--help", NULL, "print this")                                                          \
+    X(MANUAL, "--manual", NULL, "print the manual page, fbard.8 (troff)")                          \
     X(VERSION, "--version", NULL, "print the version")
 
 enum option {
@@ -171,7 +172,46 @@ static void print_help(char *message, size_t n) {
     if (used < n)
         snprintf(message + used, n - used,
                  "\nFBARD_ISA in the environment: auto, baseline, avx2 or avx512: the solver's "
-                 "instruction set.\n");
+                 "instruction set.\nThe page and the API are then at http://127.0.0.1:7800; `fbar "
+                 "help` is the client.\n");
+}
+
+// fbard.8 in the man(7) macros. A hyphen is written so that it can be pasted.
+static void print_manual(char *message, size_t n) {
+    static const char before[] =
+        ".TH FBARD 8 \"\" \"fbard " FBARD_VERSION "\" \"System Administration\"\n"
+        ".SH NAME\nfbard \\- hosts material\\-point simulations behind an HTTP API\n"
+        ".SH SYNOPSIS\n.B fbard\n[\\fIoptions\\fR]\n"
+        ".SH DESCRIPTION\nComputes scenes with the material point method, with the F\\-bar cure of "
+        "volumetric locking. Runs are created, watched, steered and read over HTTP/JSON; every frame "
+        "is journaled and published over ZeroMQ. A run that was accepted is there after a crash, and "
+        "goes on from its last checkpoint.\n.PP\n"
+        "Only loopback addresses are allowed without a token and TLS (HTTP) or CURVE (ZeroMQ).\n"
+        ".SH OPTIONS\n";
+    static const char after[] =
+        ".SH ENVIRONMENT\n"
+        ".TP\n.B FBARD_ISA\nthe solver's instruction set: auto, baseline, avx2 or avx512\n"
+        ".TP\n.B XDG_STATE_HOME\nruns are kept in its folder fbard (else ~/.local/state/fbard)\n"
+        ".TP\n.B NOTIFY_SOCKET\nset by a service manager: told READY=1 once both sockets answer, "
+        "and STOPPING=1\n"
+        ".SH SIGNALS\nSIGTERM and SIGINT end it in order: runs make checkpoints, and go on when it "
+        "is started again.\n"
+        ".SH EXIT STATUS\n0 after a signal, 2 for wrong options, 4 for a port, folder or file that "
+        "cannot be had.\n"
+        ".SH SEE ALSO\n.BR fbar (1)\n";
+    size_t used = (size_t)snprintf(message, n, "%s", before);
+    for (int k = 0; k < N_OPTIONS && used + 1 < n; k++) {
+        char line[256];
+        snprintf(line, sizeof line, ".TP\n\\fB%s\\fR%s\\fI%s\\fR\n%s\n", table[k].name,
+                 table[k].value != NULL ? " " : "", table[k].value != NULL ? table[k].value : "",
+                 table[k].doc);
+        for (const char *c = line; *c != '\0' && used + 2 < n; c++) {
+            if (*c == '-')
+                message[used++] = '\\';
+            message[used++] = *c;
+        }
+    }
+    snprintf(message + used, n - used, "%s", after);
 }
 
 static bool assign(struct options *o, enum option option, const char *value) {
@@ -208,6 +248,7 @@ static bool assign(struct options *o, enum option option, const char *value) {
         o->insecure = true;
         return true;
     case OPTION_HELP:
+    case OPTION_MANUAL:
     case OPTION_VERSION:
     case N_OPTIONS:
         break;
@@ -313,6 +354,10 @@ enum options_result options_parse(int argc, char *const *argv, struct options *o
         }
         if (option == OPTION_HELP) {
             print_help(message, message_bytes);
+            return OPTIONS_PRINTED;
+        }
+        if (option == OPTION_MANUAL) {
+            print_manual(message, message_bytes);
             return OPTIONS_PRINTED;
         }
         if (option == OPTION_VERSION) {

@@ -1,0 +1,104 @@
+"""What fbar says: JSON where it is asked for, colours on terminals only, and what to do next."""
+import json
+import os
+import pty
+import re
+import select
+import subprocess
+import time
+
+import pytest
+
+import conftest
+
+ESCAPE = re.compile(r"\x1b\[[0-9;]*m")
+
+
+def parsed(result):
+    return json.loads(result.stdout)
+
+
+@pytest.fixture
+def recording(fbar, fake):
+    daemon = fake(n_frames=4, count=60)
+    daemon.advance(4, live=False)
+    assert fbar("record", "r1", "-o", "a.h5", url=daemon.url).returncode == 0
+    return daemon
+
+
+def test_json_of_every_command_is_json(fbar, fake, recording):
+    daemon = fake(n_frames=4)
+    daemon.advance(4, live=False)
+    lines = {
+        "run": ["fake", "-o", "b.h5"], "scenes": [], "validate": ["fake"], "list": [], "show": ["r1"], "watch": ["r1"],
+        "set": ["r1", "fbar=false"], "pause": ["r1"], "resume": ["r1"], "start": ["r1"], "step": ["r1"],
+        "record": ["r1", "-o", "c.h5"], "info": ["a.h5"], "plot": ["a.h5", "-o", "a.png", "--size", "400x300"],
+        "recover": ["d.h5"], "keygen": ["keys"], "completion": ["bash"], "cancel": ["r1"], "delete": ["r1"],
+    }  # fmt: skip
+    shown = re.findall(r"^  ([a-z]+) ", fbar("help").stdout.split("examples")[0], re.M)
+    assert set(lines) | {"probes"} == set(shown)
+    for command, words in lines.items():
+        result = fbar("--json", command, *words, url=daemon.url)
+        assert result.returncode == (4 if command == "recover" else 0), (command, result.stderr)
+        assert isinstance(parsed(result), dict), command
+        assert parsed(fbar(command, "--json", *words, "--nonsense", url=daemon.url))["exit_code"] == 2
+    assert parsed(fbar("--json", "--version"))["version"] == fbar("--version").stdout.split()[1]
+
+
+def test_json_of_a_fault_says_what_is_wrong(fbar, fake):
+    daemon = fake()
+    result = fbar("--json", "show", "no", url=daemon.url)
+    assert result.returncode == 2 and parsed(result)["status"] == 404
+    daemon.problem = {"title": "Invalid", "status": 422, "detail": "1 fault",
+                      "errors": [{"pointer": "/cell", "code": "range", "detail": "must be positive"}]}
+    result = fbar("--json", "run", "fake", url=daemon.url)
+    assert result.returncode == 2 and parsed(result)["errors"] == daemon.problem["errors"]
+    result = fbar("--json", "list", url="http://127.0.0.1:1")
+    assert result.returncode == 3 and parsed(result)["exit_code"] == 3 and "127.0.0.1:1" in parsed(result)["faults"][0]
+    result = fbar("--json", "info", "none.h5")
+    assert result.returncode == 4 and parsed(result)["faults"] == [result.stderr.removeprefix("fbar: ").strip()]
+
+
+def on_a_terminal(*words, **more):
+    """What fbar writes to a terminal, standard output and error together."""
+    leader, follower = pty.openpty()
+    process = subprocess.Popen([conftest.FBAR, *map(str, words)], stdout=follower, stderr=follower, stdin=follower,
+                               env={**conftest.environment(), "TERM": "xterm", "LC_ALL": "C.UTF-8", **more})  # fmt: skip
+    os.close(follower)
+    text, end = b"", time.monotonic() + 20
+    while time.monotonic() < end:
+        try:
+            if select.select([leader], [], [], 0.1)[0]:
+                text += os.read(leader, 65536)
+            elif process.poll() is not None:
+                break
+        except OSError:  # the other end is closed
+            break
+    os.close(leader)
+    process.wait(10)
+    return text.decode()
+
+
+def test_colours_are_for_terminals(fbar, fake):
+    daemon = fake(n_frames=2)
+    daemon.advance(2, live=False)
+    for words in (["list"], ["show", "r1"], ["watch", "r1"], ["show", "no"], ["help"]):
+        plain = fbar(*words, url=daemon.url)
+        assert not ESCAPE.search(plain.stdout + plain.stderr)
+        assert ESCAPE.search(on_a_terminal("--url", daemon.url, *words)), words
+        assert not ESCAPE.search(on_a_terminal("--url", daemon.url, *words, NO_COLOR="1")), words
+        assert not ESCAPE.search(on_a_terminal("--url", daemon.url, *words, TERM="dumb")), words
+    assert not ESCAPE.search(on_a_terminal("--url", daemon.url, "--json", "list"))
+
+
+def test_messages_say_what_to_do_next(fbar, fake, recording, tmp_path):
+    assert "start one with `fbard`" in fbar("list", url="http://127.0.0.1:1").stderr
+    daemon = fake()
+    requests = len(daemon.requests)
+    result = fbar("run", "fake", "-o", "none/a.h5", url=daemon.url)
+    assert result.returncode == 4 and "none/a.h5" in result.stderr and "choose another -o" in result.stderr
+    assert len(daemon.requests) == requests  # no run was made that nobody records
+    result = fbar("run", "fake", "-o", "a.h5", url=daemon.url)
+    assert result.returncode == 4 and "holds the run r1; choose another -o" in result.stderr
+    os.chmod(tmp_path / "a.h5", 0o444)
+    assert fbar("info", "a.h5").returncode == 0
