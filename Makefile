@@ -8,7 +8,7 @@ PACKAGES = build-essential pkg-config libmicrohttpd-dev libcjson-dev libzmq3-dev
 	python3-hypothesis slowhttptest
 # Needed by some targets only: clang builds and the fuzzers; `make check-long`.
 PACKAGES_CLANG = clang-14 libomp-14-dev
-PACKAGES_LONG = $(PACKAGES_CLANG) python3-paraview prometheus
+PACKAGES_LONG = $(PACKAGES_CLANG) python3-paraview prometheus zsh groff-base systemd
 # Pictures of the report; `make check` tests it, and so needs them too.
 PACKAGES_REPORT = python3-matplotlib python3-pil
 
@@ -294,12 +294,52 @@ report: deps-report ## the paper's figures with our numbers: build/report/SIZE/r
 report-page: deps-report ## the same page of what was run so far; runs nothing
 	@$(PYTHON) bench/report $(SIZE) --page
 
-install: all ## into PREFIX (default /usr/local), under DESTDIR
-	install -d $(DESTDIR)$(PREFIX)/bin
-	install build/fbard build/fbar $(DESTDIR)$(PREFIX)/bin
+# What is generated for an installation: manual pages and completions from the tables of the programs, the solver's
+# header as one file, and what names PREFIX.
+I = $(B)/install
+INSTALL ?= install
+UNITDIR ?= $(PREFIX)/lib/systemd/system
+BASHDIR ?= $(PREFIX)/share/bash-completion/completions
+ZSHDIR ?= $(PREFIX)/share/zsh/site-functions
+$(I)/fbar.1: $(B)/fbar
+	@mkdir -p $(@D)
+	$(Q)$< __manual > $@
+$(I)/fbard.8: $(B)/fbard
+	@mkdir -p $(@D)
+	$(Q)$< --manual > $@
+$(I)/fbar.bash $(I)/fbar.zsh: $(I)/fbar.%: $(B)/fbar
+	@mkdir -p $(@D)
+	$(Q)$< completion $* > $@
+$(I)/mpm.h: server/mpm/mpm.h server/mpm/error.h server/mpm/fields.def
+	@mkdir -p $(@D)
+	$(Q)sed -e '/#include "server\/mpm\/error.h"/{r server/mpm/error.h' -e 'd}' \
+	  -e '/#include "server\/mpm\/fields.def"/{r server/mpm/fields.def' -e 'd}' $< > $@
+$(I)/libmpm.pc $(I)/fbard.service: $(I)/%: packaging/%.in FORCE
+	@mkdir -p $(@D)
+	$(Q)sed -e 's|@PREFIX@|$(PREFIX)|g' -e 's|@VERSION@|$(VERSION)|g' $< > $@
+.PHONY: FORCE
+INSTALLED = $(addprefix $(I)/,fbar.1 fbard.8 fbar.bash fbar.zsh mpm.h libmpm.pc fbard.service)
 
-uninstall:
-	rm -f $(DESTDIR)$(PREFIX)/bin/fbard $(DESTDIR)$(PREFIX)/bin/fbar
+install: all $(INSTALLED) $(B)/libmpm.a ## into PREFIX (default /usr/local), under DESTDIR
+	$(INSTALL) -d $(addprefix $(DESTDIR),$(PREFIX)/bin $(PREFIX)/include/libmpm $(PREFIX)/lib/pkgconfig $(UNITDIR) \
+	  $(PREFIX)/share/fbard/scenes/reference $(PREFIX)/share/man/man1 $(PREFIX)/share/man/man8 $(BASHDIR) $(ZSHDIR))
+	$(INSTALL) $(B)/fbard $(B)/fbar $(DESTDIR)$(PREFIX)/bin
+	$(INSTALL) -m 644 $(SCENES) scenes/README.md $(DESTDIR)$(PREFIX)/share/fbard/scenes
+	$(INSTALL) -m 644 $(TABLES) $(DESTDIR)$(PREFIX)/share/fbard/scenes/reference
+	$(INSTALL) -m 644 $(I)/fbar.1 $(DESTDIR)$(PREFIX)/share/man/man1
+	$(INSTALL) -m 644 $(I)/fbard.8 $(DESTDIR)$(PREFIX)/share/man/man8
+	$(INSTALL) -m 644 $(I)/fbar.bash $(DESTDIR)$(BASHDIR)/fbar
+	$(INSTALL) -m 644 $(I)/fbar.zsh $(DESTDIR)$(ZSHDIR)/_fbar
+	$(INSTALL) -m 644 $(I)/fbard.service $(DESTDIR)$(UNITDIR)
+	$(INSTALL) -m 644 $(I)/mpm.h $(DESTDIR)$(PREFIX)/include/libmpm
+	$(INSTALL) -m 644 $(B)/libmpm.a $(DESTDIR)$(PREFIX)/lib
+	$(INSTALL) -m 644 $(I)/libmpm.pc $(DESTDIR)$(PREFIX)/lib/pkgconfig
+
+uninstall: ## what install put there
+	rm -f $(addprefix $(DESTDIR),$(addprefix $(PREFIX)/bin/,fbard fbar) $(PREFIX)/share/man/man1/fbar.1 \
+	  $(PREFIX)/share/man/man8/fbard.8 $(BASHDIR)/fbar $(ZSHDIR)/_fbar $(UNITDIR)/fbard.service \
+	  $(PREFIX)/lib/libmpm.a $(PREFIX)/lib/pkgconfig/libmpm.pc)
+	rm -rf $(DESTDIR)$(PREFIX)/share/fbard $(DESTDIR)$(PREFIX)/include/libmpm
 
 format: ## clang-format over all sources
 	clang-format -i $(shell git ls-files '*.c' '*.h')
