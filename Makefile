@@ -5,7 +5,7 @@
 PACKAGES = build-essential pkg-config libmicrohttpd-dev libcjson-dev libzmq3-dev libhdf5-dev \
 	libcurl4-gnutls-dev libxxhash-dev libcmocka-dev gnuplot-nox fonts-dejavu-core curl openssl \
 	python3 python3-numpy python3-h5py python3-pytest python3-zmq python3-jsonschema \
-	python3-hypothesis slowhttptest
+	python3-hypothesis slowhttptest libjs-chart.js
 # Needed by some targets only: clang builds and the fuzzers; `make check-long`.
 PACKAGES_CLANG = clang-14 libomp-14-dev
 PACKAGES_LONG = $(PACKAGES_CLANG) python3-paraview prometheus zsh groff-base systemd
@@ -57,6 +57,9 @@ SERVER_SRC = $(sort $(wildcard server/*.c))
 CLIENT_SRC = $(sort $(wildcard client/*.c))
 SCENES = $(sort $(wildcard scenes/*.json))
 TABLES = $(sort $(wildcard scenes/reference/*.csv))
+# The live page, and the library that draws its curves.
+CHARTJS ?= /usr/share/javascript/chart.js/chart.min.js
+PAGE = $(sort $(wildcard server/page/*)) $(CHARTJS)
 
 obj = $(patsubst %.c,$(B)/obj/%.o,$(1))
 
@@ -115,11 +118,11 @@ $(B)/obj/%.$(1).o: %.c Makefile
 endef
 $(foreach level,$(LEVELS),$(eval $(call lanes_rule,$(level))))
 
-# The built-in scenes and the tables that they cite, embedded as they are: $(1) files, $(2) name of the list,
+# The built-in scenes, the tables that they cite and the live page, embedded as they are: $(1) files, $(2) name of the list,
 # $(3) their ending.
 embed = $(Q){ echo '\#include "server/scenes_data.h"'; i=0; \
 	for f in $(1); do echo "static const char text_$$i[] = {"; i=$$((i + 1)); \
-	od -An -v -tx1 $$f | sed 's/ \([0-9a-f][0-9a-f]\)/0x\1,/g'; echo "0};"; done; \
+	od -An -v -tx1 $$f | sed "s/ \([0-9a-f][0-9a-f]\)/'\\\\x\1',/g"; echo "0};"; done; \
 	echo "const struct scenes_data $(2)[] = {"; i=0; \
 	for f in $(1); do echo "{\"$$(basename $$f $(3))\", text_$$i, sizeof text_$$i - 1},"; i=$$((i + 1)); done; \
 	echo "{0, 0, 0}};"; } > $@
@@ -131,7 +134,13 @@ $(B)/gen/tables_data.c: $(TABLES) Makefile
 	$(call say,EMBED,tables)
 	@mkdir -p $(@D)
 	$(call embed,$(TABLES),tables_data,.csv)
-GEN_OBJ = $(B)/obj/gen/scenes_data.o $(B)/obj/gen/tables_data.o
+$(B)/gen/page_data.c: $(PAGE) Makefile
+	$(call say,EMBED,page)
+	@mkdir -p $(@D)
+	$(call embed,$(PAGE),page_data,)
+$(CHARTJS):
+	@echo "$@ is missing: make deps installs it (Debian's libjs-chart.js), or set CHARTJS"; exit 1
+GEN_OBJ = $(addprefix $(B)/obj/gen/,scenes_data.o tables_data.o page_data.o)
 $(GEN_OBJ): $(B)/obj/gen/%.o: $(B)/gen/%.c
 	@mkdir -p $(@D)
 	$(Q)$(CC) $(ALL_CFLAGS) -c $< -o $@

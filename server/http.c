@@ -339,6 +339,9 @@ static struct MHD_Response *make_response(struct http_reply *reply, int socket) 
         response = MHD_create_response_from_fd_at_offset64(reply->bytes, reply->fd, reply->offset);
         if (response != NULL)
             reply->fd = -1;
+    } else if (reply->constant != NULL) {
+        char *text = (char *)(uintptr_t)reply->constant; // which libmicrohttpd does not write to
+        response = MHD_create_response_from_buffer(reply->bytes, text, MHD_RESPMEM_PERSISTENT);
     } else {
         response =
             MHD_create_response_from_buffer(reply->bytes, reply->body, MHD_RESPMEM_MUST_FREE);
@@ -361,7 +364,8 @@ static enum MHD_Result send_reply(struct http_request *q) {
     peer_enter(q->server, q->peer, endless ? PEER_STREAMING : PEER_REPLYING);
     if (reply->type != NULL)
         MHD_add_response_header(response, "Content-Type", reply->type);
-    MHD_add_response_header(response, "Cache-Control", "no-store");
+    MHD_add_response_header(response, "Cache-Control",
+                            reply->cache != NULL ? reply->cache : "no-store");
     MHD_add_response_header(response, "X-Content-Type-Options", "nosniff");
     for (unsigned k = 0; k < reply->n_headers; k++)
         MHD_add_response_header(response, reply->headers[k].name, reply->headers[k].value);

@@ -23,8 +23,10 @@ bool http_decode(char *text);
 
 struct http_reply {
     int status;
-    const char *type; // of the body, static; NULL = no body
-    char *body;       // from malloc; the server's
+    const char *type;     // of the body, static; NULL = no body
+    char *body;           // from malloc; the server's
+    const char *constant; // the body instead, when it is part of the program
+    const char *cache;    // Cache-Control, static; NULL: no-store
     size_t bytes;
     int fd; // >= 0: the body is `bytes` bytes of it from `offset`; the server closes it
     uint64_t offset;

@@ -58,6 +58,9 @@ static int run_daemon(const struct options *options, const sigset_t *signals) {
     struct http_server *http = NULL;
     struct run_meters meters = {0};
     host.meters = &meters;
+    struct run_bell bell;
+    run_bell_init(&bell);
+    host.bell = &bell;
     if (!guard_init(&routes.guard, options->http_host, options->token_file, why, sizeof why))
         goto done;
     host.slots = slots_create(options->slots, options->memory_limit);
@@ -94,6 +97,8 @@ static int run_daemon(const struct options *options, const sigset_t *signals) {
 done:
     if (status != 0 && why[0] != '\0')
         fprintf(stderr, "fbard: %s\n", why);
+    atomic_store(&routes.ending, true);
+    run_bell_ring(host.bell);
     if (http != NULL)
         http_quiesce(http);
     if (routes.runs != NULL)
@@ -103,6 +108,7 @@ done:
     publish_stop(host.publisher);
     slots_free(host.slots);
     guard_free(&routes.guard);
+    run_bell_destroy(&bell);
     return status;
 }
 

@@ -13,6 +13,7 @@
 static const struct {
     const char *status, *description;
 } problems[] = {
+    {"304", "the copy that the browser has is still the same"},
     {"400", "not JSON, or a malformed request"},
     {"401", "no valid bearer token"},
     {"403", "foreign Origin"},
@@ -189,7 +190,8 @@ static void add_problems(cJSON *responses, const char *statuses) {
             continue;
         cJSON *response = cJSON_AddObjectToObject(responses, problems[k].status);
         cJSON_AddStringToObject(response, "description", problems[k].description);
-        add_content(response, "application/problem+json", "Problem");
+        if (problems[k].status[0] >= '4')
+            add_content(response, "application/problem+json", "Problem");
     }
 }
 

@@ -12,6 +12,9 @@
 
 #define JSON "application/json"
 #define FRAME "application/vnd.fbard.frame"
+#define THINNING                                                                                   \
+    "max_particles: send every n-th particle, so that there are no more than this\n"               \
+    "fields: comma-separated; send these fields only, as far as the frame has them"
 #define ACTION(verb, code, text)                                                                   \
     {                                                                                              \
         "POST", "/v1/runs/{id}:" verb, routes_serve_action, RUN_DO_##code, text, "Empty", false,   \
@@ -19,6 +22,14 @@
     }
 
 const struct route routes_table[] = {
+    {"GET", "/", routes_serve_page, -1, "The live page", NULL, false, false, 200, "Text",
+     "text/html",
+     "header If-None-Match: ETag of the copy that the browser has; 304 when it is still the same",
+     "304"},
+    {"GET", "/page/{file}", routes_serve_page, -1, "What the live page is made of", NULL, false,
+     false, 200, "Text", "text/javascript text/css image/svg+xml",
+     "header If-None-Match: ETag of the copy that the browser has; 304 when it is still the same",
+     "304"},
     {"GET", "/healthz", routes_serve_health, -1, "Alive", NULL, false, false, 200, "Health", JSON,
      NULL, NULL},
     {"GET", "/readyz", routes_serve_ready, -1, "Able to take a run", NULL, false, false, 200,
@@ -47,6 +58,9 @@ const struct route routes_table[] = {
      "409 503 507"},
     {"GET", "/v1/runs", routes_serve_runs, -1, "All runs, oldest first", NULL, false, false, 200,
      "Runs", JSON, NULL, NULL},
+    {"GET", "/v1/events", routes_serve_all_events, -1,
+     "Server-sent events of all runs: run, gone, ready, end", NULL, false, false, 200, "Text",
+     "text/event-stream", NULL, "503"},
     {"GET", "/v1/runs/{id}", routes_serve_run, -1, "A run", NULL, false, false, 200, "Run", JSON,
      NULL, NULL},
     {"DELETE", "/v1/runs/{id}", routes_serve_delete, -1, "Remove a finished run and its files",
@@ -80,8 +94,7 @@ const struct route routes_table[] = {
      "400 503"},
     {"GET", "/v1/runs/{id}/stream", routes_serve_stream, -1,
      "Frames as they come, back to back; the newest where the reader is behind", NULL, false, false,
-     200, "Frame", FRAME,
-     "max_particles: send every n-th particle, so that there are no more than this", "400 503"},
+     200, "Frame", FRAME, THINNING, "400 503"},
     {"GET", "/v1/runs/{id}/recorders", routes_serve_recorders, -1,
      "Who records the run, and how far", NULL, false, false, 200, "Recorders", JSON, NULL, NULL},
     {"PUT", "/v1/runs/{id}/recorders/{name}", routes_serve_record, -1,
@@ -91,10 +104,10 @@ const struct route routes_table[] = {
      "Unregister a recorder: no frame is kept for it any more", NULL, false, false, 200,
      "Recorders", JSON, NULL, "409 507"},
     {"GET", "/v1/runs/{id}/frames", routes_serve_frames, -1, "Index of the frames", NULL, false,
-     false, 200, "Frames", JSON, NULL, NULL},
+     false, 200, "Frames", JSON, "since_seq: only frames after this one", "400"},
     {"GET", "/v1/runs/{id}/frames/{seq}", routes_serve_frame, -1,
      "A frame by its number, or `latest`: the bytes that were published", NULL, false, false, 200,
-     "Frame", FRAME, NULL, "500"},
+     "Frame", FRAME, THINNING, "400 500 503"},
 };
 const size_t routes_count = sizeof routes_table / sizeof *routes_table;
 _Static_assert(sizeof routes_table / sizeof *routes_table <= ROUTES_MAX, "counted for /metrics");
@@ -207,10 +220,12 @@ static bool admit(void *context, struct http_request *request, struct http_reply
     struct call call = {.routes = routes, .request = request, .reply = reply};
     int status = guard_verdict(&routes->guard, http_host(request), http_header(request, "Origin"),
                                http_header(request, "Authorization"));
-    if (status != 0) {
+    if (status != 0 && (status != 401 || !routes_is_page(http_path(request)))) {
         reply_problem(reply, status, NULL, "%s", guard_detail(status));
     } else if (route(&call)) {
-        if (atomic_load(&routes->open) || call.route->serve == routes_serve_health)
+        // The page tells nothing about this daemon, and is where a browser is asked for the token.
+        if (atomic_load(&routes->open) || call.route->serve == routes_serve_health ||
+            call.route->serve == routes_serve_page)
             return true;
         reply_problem(reply, 503, NULL, "the daemon is reading its earlier runs");
     }

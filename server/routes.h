@@ -24,6 +24,7 @@ struct routes {
     struct {
         atomic_ullong replies[ROUTES_STATUSES], microseconds;
     } tally[ROUTES_MAX + 1]; // by route; the last: what reached none
+    atomic_bool ending;      // the daemon is
     atomic_bool open;        // the runs of earlier daemons are listed; until then 503
 };
 

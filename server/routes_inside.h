@@ -2,6 +2,7 @@
 #pragma once
 #include "server/reply.h"
 #include "server/routes.h"
+#include "server/thin.h"
 
 #define ROUTES_SEGMENT 256     // bytes of one segment of a path
 #define ROUTES_STREAMS_MAX 128 // at a time, so that some connections are left for all else
@@ -16,6 +17,7 @@ struct call {
 };
 
 void routes_serve_action(struct call *c);
+void routes_serve_all_events(struct call *c);
 void routes_serve_config(struct call *c);
 void routes_serve_configure(struct call *c);
 void routes_serve_create(struct call *c);
@@ -27,6 +29,7 @@ void routes_serve_health(struct call *c);
 void routes_serve_materials(struct call *c);
 void routes_serve_metrics(struct call *c);
 void routes_serve_openapi(struct call *c);
+void routes_serve_page(struct call *c);
 void routes_serve_probes(struct call *c);
 void routes_serve_ready(struct call *c);
 void routes_serve_record(struct call *c);
@@ -44,6 +47,8 @@ void routes_serve_validate(struct call *c);
 
 // Counts a reply for /metrics; `route` is NULL where there was none.
 void routes_tally(struct routes *routes, const struct route *route, int status, double seconds);
+bool routes_is_page(const char *path);                   // of the live page, which needs no token
+cJSON *routes_run_json(struct run *run);                 // the run object, new
 double routes_progress(const struct run_status *status); // 0..1
 // The run that the path names, retained; NULL when the reply is a 404.
 struct run *routes_run_of(struct call *c);
@@ -51,6 +56,13 @@ struct run *routes_run_of(struct call *c);
 // journal holds.
 cJSON *routes_recorders_json(struct run *run);
 cJSON *routes_journal_json(struct run *run);
+// Counts a stream; false when the reply is a 503: too many are open.
+bool routes_stream_begins(struct call *c);
+// What of a frame is asked for in the query; false when the reply is a 400.
+bool routes_thinning(struct call *c, struct thin *out);
+// A whole number of the query, 0 or more, `absent` when it is not there; false when the reply is a
+// 400.
+bool routes_query_number(struct call *c, const char *key, uint64_t absent, uint64_t *out);
 // A fault for every key of `body` that is not in `known` ("one two").
 void routes_unknown_keys(const cJSON *body, const char *known, struct faults *faults);
 // "must be EXPECTED, got ..." of a member of the body.

@@ -7,6 +7,44 @@
 #include "server/log.h"
 #include "server/routes_inside.h"
 
+bool routes_query_number(struct call *c, const char *key, uint64_t absent, uint64_t *out) {
+    char text[32];
+    *out = absent;
+    if (!http_query(c->request, key, text, sizeof text))
+        return true;
+    if (text[0] == '\0' || strlen(text) > 19 || strspn(text, "0123456789") != strlen(text)) {
+        reply_problem(c->reply, 400, NULL, "%s must be a whole number, 0 or more", key);
+        return false;
+    }
+    *out = strtoull(text, NULL, 10);
+    return true;
+}
+
+bool routes_thinning(struct call *c, struct thin *out) {
+    char text[256], *rest = text;
+    *out = (struct thin){0};
+    if (http_query(c->request, "max_particles", text, sizeof text)) {
+        if (strlen(text) <= 15 && strspn(text, "0123456789") == strlen(text))
+            out->max_particles = (size_t)strtoull(text, NULL, 10);
+        if (out->max_particles == 0) {
+            reply_problem(c->reply, 400, NULL,
+                          "max_particles must be a whole number, 1 or more, got %.40s", text);
+            return false;
+        }
+    }
+    if (!http_query(c->request, "fields", text, sizeof text))
+        return true;
+    for (char *name; (name = strsep(&rest, ",")) != NULL;) {
+        int field = mpm_field_parse(name);
+        if (field < 0) {
+            reply_problem(c->reply, 400, NULL, "fields: there is no field %.40s", name);
+            return false;
+        }
+        out->fields |= (uint32_t)1 << field;
+    }
+    return true;
+}
+
 // ---- Probes -----------------------------------------------------------------------------------
 
 struct rows {
@@ -107,18 +145,10 @@ static void probes_csv(struct call *c, struct series *series, bool all, uint64_t
 }
 
 void routes_serve_probes(struct call *c) {
-    char since[32];
-    uint64_t after = 0;
-    bool all = true;
-    if (http_query(c->request, "since_step", since, sizeof since)) {
-        all = false;
-        if (since[0] == '\0' || strlen(since) > 19 ||
-            strspn(since, "0123456789") != strlen(since)) {
-            reply_problem(c->reply, 400, NULL, "since_step must be a whole number, 0 or more");
-            return;
-        }
-        after = strtoull(since, NULL, 10);
-    }
+    uint64_t after;
+    if (!routes_query_number(c, "since_step", UINT64_MAX, &after))
+        return;
+    bool all = after == UINT64_MAX;
     struct run *run = routes_run_of(c);
     if (run == NULL)
         return;
@@ -136,6 +166,9 @@ void routes_serve_probes(struct call *c) {
 // ---- Frames -----------------------------------------------------------------------------------
 
 void routes_serve_frames(struct call *c) {
+    uint64_t since;
+    if (!routes_query_number(c, "since_seq", UINT64_MAX, &since))
+        return;
     struct run *run = routes_run_of(c);
     if (run == NULL)
         return;
@@ -152,7 +185,8 @@ void routes_serve_frames(struct call *c) {
         cJSON_AddItemToArray(gone, range);
     }
     cJSON *list = cJSON_AddArrayToObject(json, "frames");
-    for (uint64_t seq = first; journal != NULL && journal_frame(journal, seq, &frame); seq++) {
+    uint64_t begin = since == UINT64_MAX || since < first ? first : since + 1;
+    for (uint64_t seq = begin; journal != NULL && journal_frame(journal, seq, &frame); seq++) {
         char digest[24];
         cJSON *item = cJSON_CreateObject();
         snprintf(digest, sizeof digest, "%016llx", (unsigned long long)frame.digest);
@@ -172,7 +206,7 @@ void routes_serve_frames(struct call *c) {
     run_release(run);
 }
 
-static void reply_frame(struct call *c, struct run *run) {
+static void reply_frame(struct call *c, struct run *run, const struct thin *thin) {
     struct journal *journal = run_journal(run);
     struct journal_frame frame;
     char why[JOURNAL_WHY];
@@ -186,6 +220,21 @@ static void reply_frame(struct call *c, struct run *run) {
     if ((!latest && !number) || seq >= n) {
         reply_problem(c->reply, 404, NULL, "run %.80s has no frame %.40s; it has %llu so far",
                       c->names[0], text, (unsigned long long)n);
+        return;
+    }
+    struct journal_map map;
+    if (thin_asked(thin) && journal_frame_map(journal, seq, &map, why)) {
+        size_t bytes = 0;
+        c->reply->body = (char *)thin_frame(thin, map.frame, map.bytes, &bytes);
+        c->reply->bytes = bytes;
+        journal_frame_unmap(&map);
+        if (c->reply->body == NULL) {
+            reply_problem(c->reply, 503, NULL, "no memory for the frame");
+            return;
+        }
+        c->reply->status = 200;
+        c->reply->type = "application/vnd.fbard.frame";
+        http_reply_header(c->reply, "Fbard-Seq", "%llu", (unsigned long long)seq);
         return;
     }
     int fd = journal_frame_open(journal, seq, &frame, why);
@@ -215,9 +264,12 @@ static void reply_frame(struct call *c, struct run *run) {
 }
 
 void routes_serve_frame(struct call *c) {
+    struct thin thin;
+    if (!routes_thinning(c, &thin))
+        return;
     struct run *run = routes_run_of(c);
     if (run == NULL)
         return;
-    reply_frame(c, run);
+    reply_frame(c, run, &thin);
     run_release(run);
 }

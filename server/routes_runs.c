@@ -101,7 +101,7 @@ double routes_progress(const struct run_status *status) {
     return done > 0 ? (done < 1 ? done : 1) : 0; // 0 for NaN as well
 }
 
-static cJSON *run_json(struct run *run) {
+cJSON *routes_run_json(struct run *run) {
     struct run_status status = run_status(run);
     struct series *series = run_series(run);
     cJSON *json = cJSON_CreateObject(), *warnings;
@@ -172,7 +172,7 @@ void routes_serve_runs(struct call *c) {
     struct run **all = runs_all(c->routes->runs, &count);
     cJSON *json = cJSON_CreateObject(), *list = cJSON_AddArrayToObject(json, "runs");
     for (size_t k = 0; k < count; k++) {
-        cJSON_AddItemToArray(list, run_json(all[k]));
+        cJSON_AddItemToArray(list, routes_run_json(all[k]));
         run_release(all[k]);
     }
     free(all);
@@ -183,7 +183,7 @@ void routes_serve_run(struct call *c) {
     struct run *run = routes_run_of(c);
     if (run == NULL)
         return;
-    reply_json(c->reply, 200, run_json(run));
+    reply_json(c->reply, 200, routes_run_json(run));
     run_release(run);
 }
 
@@ -279,7 +279,7 @@ static bool idempotency(struct call *c, struct run_definition *out, char *digest
 }
 
 static void reply_created(struct call *c, struct run *run, bool again) {
-    reply_json(c->reply, 201, run_json(run));
+    reply_json(c->reply, 201, routes_run_json(run));
     if (again)
         http_reply_header(c->reply, "Idempotency-Replayed", "true");
     http_reply_header(c->reply, "Location", "/v1/runs/%s", run_id(run));
@@ -407,7 +407,7 @@ void routes_serve_action(struct call *c) {
     } else {
         run_command(run, &command);
         if (command.outcome == RUN_DONE) {
-            cJSON *json = run_json(run);
+            cJSON *json = routes_run_json(run);
             reply_add(json, "effective_step", (double)command.effective_step);
             if (command.action == RUN_DO_SNAPSHOT)
                 reply_add(json, "frame_seq", (double)command.frame_seq);

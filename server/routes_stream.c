@@ -5,7 +5,6 @@
 #include <stdlib.h>
 #include <string.h>
 
-#include "proto/frame.h"
 #include "server/log.h"
 #include "server/routes_inside.h"
 
@@ -13,7 +12,7 @@
 #define HEARTBEAT_SECONDS 10.0 // a peer that is gone is noticed when something is sent to it
 #define WAIT_SECONDS 0.5       // the server looks in between whether the peer is still there
 
-static bool stream_begins(struct call *c) {
+bool routes_stream_begins(struct call *c) {
     if (atomic_fetch_add(&c->routes->streams, 1) < ROUTES_STREAMS_MAX)
         return true;
     atomic_fetch_sub(&c->routes->streams, 1);
@@ -194,7 +193,7 @@ void routes_serve_events(struct call *c) {
     struct run *run = routes_run_of(c);
     if (run == NULL)
         return;
-    struct event_stream *s = stream_begins(c) ? calloc(1, sizeof *s) : NULL;
+    struct event_stream *s = routes_stream_begins(c) ? calloc(1, sizeof *s) : NULL;
     if (s == NULL) {
         run_release(run);
         return;
@@ -218,7 +217,7 @@ struct frame_stream {
     struct run *run;
     uint64_t next; // frame
     uint64_t news;
-    size_t max_particles; // 0: all
+    struct thin thin;
     struct journal_map map;
     bool mapped;
     unsigned char *thinned;
@@ -244,72 +243,6 @@ static void frames_close(void *context) {
     free(s);
 }
 
-// Header of a frame -> plan of the same frame with every `stride`-th particle. The plan borrows
-// from the JSON and from `probes`.
-static bool thin_plan(const cJSON *header, size_t stride, char *probes, struct frame_plan *out) {
-    const cJSON *field, *shape = NULL;
-    size_t count = (size_t)json_member(header, "count")->valuedouble;
-    *out = (struct frame_plan){
-        .run = json_member(header, "run")->valuestring,
-        .epoch = (uint32_t)json_member(header, "epoch")->valuedouble,
-        .seq = (uint64_t)json_member(header, "seq")->valuedouble,
-        .step = (uint64_t)json_member(header, "step")->valuedouble,
-        .time = json_member(header, "time")->valuedouble,
-        .dimension = (int)json_member(header, "dimension")->valuedouble,
-        .count = (count + stride - 1) / stride,
-        .fbar = cJSON_IsTrue(json_member(header, "fbar")),
-        .state = json_member(header, "state")->valuestring,
-        .end = cJSON_IsTrue(json_member(header, "end")),
-        .probes = probes,
-    };
-    cJSON_ArrayForEach(field, json_member(header, "fields")) {
-        struct frame_field *to = &out->fields[out->n_fields++];
-        *to = (struct frame_field){.name = json_member(field, "name")->valuestring,
-                                   .unit = json_member(field, "unit")->valuestring,
-                                   .dtype = json_member(field, "dtype")->valuestring};
-        cJSON_ArrayForEach(shape, json_member(field, "shape")) {
-            to->shape[to->rank] = to->rank == 0 ? out->count : (size_t)shape->valuedouble;
-            to->rank++;
-        }
-    }
-    return frame_layout(out) == 0;
-}
-
-// A new frame with fewer particles, of a whole frame that this daemon wrote. NULL without memory.
-static unsigned char *frame_thin(const struct journal_map *map, size_t max_particles,
-                                 size_t *bytes) {
-    struct faults faults = {0};
-    struct frame_view view;
-    struct frame_plan plan;
-    unsigned char *out = NULL;
-    char why[128];
-    if (frame_peek(map->frame, map->bytes, &view, why, sizeof why) != 0)
-        return NULL;
-    cJSON *header = json_parse(view.header, view.header_bytes, &faults);
-    char *probes = header != NULL ? json_print(json_member(header, "probes"), false) : NULL;
-    size_t count = header != NULL ? (size_t)json_member(header, "count")->valuedouble : 0;
-    size_t stride = (count + max_particles - 1) / max_particles;
-    if (probes != NULL && thin_plan(header, stride > 0 ? stride : 1, probes, &plan))
-        out = aligned_alloc(FRAME_ALIGN, plan.total_bytes);
-    if (out != NULL) {
-        frame_write_header(&plan, out);
-        for (size_t k = 0; k < plan.n_fields; k++) {
-            const cJSON *field = cJSON_GetArrayItem(json_member(header, "fields"), (int)k);
-            const unsigned char *from =
-                map->frame + (size_t)json_member(field, "offset")->valuedouble;
-            size_t row = plan.count > 0 ? plan.fields[k].bytes / plan.count : 0;
-            for (size_t p = 0; p < plan.count; p++)
-                memcpy(out + plan.fields[k].offset + p * row, from + p * stride * row, row);
-        }
-        frame_seal(out);
-        *bytes = plan.total_bytes;
-    }
-    free(probes);
-    cJSON_Delete(header);
-    faults_free(&faults);
-    return out;
-}
-
 // Whether there is a frame to send: the newest, whatever came between.
 static bool frames_next(struct frame_stream *s) {
     struct journal *journal = run_journal(s->run);
@@ -330,8 +263,8 @@ static bool frames_next(struct frame_stream *s) {
     s->next = n;
     s->at = s->map.frame;
     s->left = s->map.bytes;
-    if (s->max_particles > 0) {
-        s->thinned = frame_thin(&s->map, s->max_particles, &s->left);
+    if (thin_asked(&s->thin)) {
+        s->thinned = thin_frame(&s->thin, s->map.frame, s->map.bytes, &s->left);
         s->at = s->thinned;
         if (s->thinned == NULL)
             s->left = 0;
@@ -358,29 +291,20 @@ static size_t frames_produce(void *context, char *out, size_t bytes) {
 }
 
 void routes_serve_stream(struct call *c) {
-    char text[32];
-    size_t most = 0;
-    if (http_query(c->request, "max_particles", text, sizeof text)) {
-        most = strlen(text) <= 15 && strspn(text, "0123456789") == strlen(text)
-                   ? (size_t)strtoull(text, NULL, 10)
-                   : 0;
-        if (most == 0) {
-            reply_problem(c->reply, 400, NULL,
-                          "max_particles must be a whole number, 1 or more, got %.40s", text);
-            return;
-        }
-    }
+    struct thin thin;
+    if (!routes_thinning(c, &thin))
+        return;
     struct run *run = routes_run_of(c);
     if (run == NULL)
         return;
-    struct frame_stream *s = stream_begins(c) ? calloc(1, sizeof *s) : NULL;
+    struct frame_stream *s = routes_stream_begins(c) ? calloc(1, sizeof *s) : NULL;
     if (s == NULL) {
         run_release(run);
         return;
     }
     uint64_t n = run_journal(run) != NULL ? journal_n_frames(run_journal(run)) : 0;
     *s = (struct frame_stream){
-        .routes = c->routes, .run = run, .max_particles = most, .next = n > 0 ? n - 1 : 0};
+        .routes = c->routes, .run = run, .thin = thin, .next = n > 0 ? n - 1 : 0};
     run_viewers(run, 1);
     c->reply->status = 200;
     c->reply->type = "application/vnd.fbard.frame";

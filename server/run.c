@@ -173,14 +173,20 @@ void run_tell(struct run *r) {
     r->news++;
     pthread_cond_broadcast(&r->told);
     pthread_mutex_unlock(&r->lock);
+    run_bell_ring(r->host->bell);
 }
 
-uint64_t run_news(struct run *r, uint64_t seen, double seconds) {
+static struct timespec from_now(double seconds) {
     struct timespec until;
     clock_gettime(CLOCK_MONOTONIC, &until);
     double sum = 1e-9 * (double)until.tv_nsec + seconds;
     until.tv_sec += (time_t)sum;
     until.tv_nsec = (long)((sum - floor(sum)) * 1e9);
+    return until;
+}
+
+uint64_t run_news(struct run *r, uint64_t seen, double seconds) {
+    struct timespec until = from_now(seconds);
     pthread_mutex_lock(&r->lock);
     while (r->news == seen && !atomic_load(&r->stop))
         if (pthread_cond_timedwait(&r->told, &r->lock, &until) != 0)
@@ -188,6 +194,41 @@ uint64_t run_news(struct run *r, uint64_t seen, double seconds) {
     uint64_t news = r->news;
     pthread_mutex_unlock(&r->lock);
     return news;
+}
+
+void run_bell_init(struct run_bell *bell) {
+    pthread_condattr_t monotonic;
+    pthread_condattr_init(&monotonic);
+    pthread_condattr_setclock(&monotonic, CLOCK_MONOTONIC);
+    pthread_mutex_init(&bell->lock, NULL);
+    pthread_cond_init(&bell->rung, &monotonic);
+    pthread_condattr_destroy(&monotonic);
+    bell->count = 0;
+}
+
+void run_bell_destroy(struct run_bell *bell) {
+    pthread_mutex_destroy(&bell->lock);
+    pthread_cond_destroy(&bell->rung);
+}
+
+void run_bell_ring(struct run_bell *bell) {
+    if (bell == NULL)
+        return;
+    pthread_mutex_lock(&bell->lock);
+    bell->count++;
+    pthread_cond_broadcast(&bell->rung);
+    pthread_mutex_unlock(&bell->lock);
+}
+
+uint64_t run_bell_wait(struct run_bell *bell, uint64_t seen, double seconds) {
+    struct timespec until = from_now(seconds);
+    pthread_mutex_lock(&bell->lock);
+    while (bell->count == seen)
+        if (pthread_cond_timedwait(&bell->rung, &bell->lock, &until) != 0)
+            break;
+    uint64_t count = bell->count;
+    pthread_mutex_unlock(&bell->lock);
+    return count;
 }
 
 bool run_stopping(const struct run *r) {

@@ -3,6 +3,7 @@
 // The run's thread is the only one that touches the simulation. Others post a command, which takes
 // effect between two steps, or read the status copy (docs/design.md).
 #pragma once
+#include <pthread.h>
 #include <stdatomic.h>
 #include <stdbool.h>
 #include <stddef.h>
@@ -110,6 +111,18 @@ struct run_meters {
     atomic_ullong steps, particle_steps;
 };
 
+// Rung when something has happened to any run, for those who watch all of them.
+struct run_bell {
+    pthread_mutex_t lock;
+    pthread_cond_t rung;
+    uint64_t count;
+};
+void run_bell_init(struct run_bell *bell);
+void run_bell_destroy(struct run_bell *bell);
+void run_bell_ring(struct run_bell *bell); // NULL is nobody's
+// As run_news: waits until it was rung since `seen` was returned, at most `seconds`.
+uint64_t run_bell_wait(struct run_bell *bell, uint64_t seen, double seconds);
+
 // What a run needs of the daemon; outlives every run.
 struct run_host {
     const char *data_dir;
@@ -119,6 +132,7 @@ struct run_host {
     enum mpm_isa isa;
     size_t memory_limit;
     struct run_meters *meters; // may be NULL
+    struct run_bell *bell;     // may be NULL
 };
 
 // The warnings that the scene alone calls for, of the F-bar, dt and dt_limit in `status`.

@@ -228,6 +228,8 @@ enum runs_result runs_add(struct runs *s, const struct run_definition *definitio
         pthread_mutex_unlock(&s->lock);
     }
     pthread_mutex_unlock(&s->making);
+    if (result == RUNS_CREATED)
+        run_bell_ring(s->host->bell);
     return result;
 }
 
@@ -260,8 +262,10 @@ enum runs_removal runs_remove(struct runs *s, const char *id, enum run_state *st
         run = NULL;
     }
     pthread_mutex_unlock(&s->making);
-    if (run != NULL)
+    if (run != NULL) {
         log_info("deleted", "run=%s", id);
+        run_bell_ring(s->host->bell);
+    }
     run_release(run);
     return result;
 }

@@ -19,7 +19,7 @@ ROUTES = {
     "/v1/runs/{id}:snapshot": {"post"}, "/v1/runs/{id}/config": {"get", "patch"}, "/v1/runs/{id}/scene": {"get"},
     "/v1/runs/{id}/probes": {"get"}, "/v1/runs/{id}/frames": {"get"}, "/v1/runs/{id}/frames/{seq}": {"get"},
     "/v1/runs/{id}/events": {"get"}, "/v1/runs/{id}/stream": {"get"}, "/metrics": {"get"},
-    "/v1/runs/{id}/recorders": {"get"}, "/v1/runs/{id}/recorders/{name}": {"put", "delete"},
+    "/": {"get"}, "/page/{file}": {"get"}, "/v1/events": {"get"}, "/v1/runs/{id}/recorders": {"get"}, "/v1/runs/{id}/recorders/{name}": {"put", "delete"},
 }  # fmt: skip
 METHODS = ("get", "post", "put", "patch", "delete", "head", "options", "trace")
 
@@ -106,7 +106,7 @@ def test_every_route_of_the_document_answers(daemon, document):
     run = daemon.create(water(time={"end": 0.005}))["id"]
     daemon.wait(run, "completed")
     for path, method, operation in operations(document):
-        url = path.replace("{id}", run).replace("{seq}", "0").replace("{name}", "dam-break")
+        url = path.replace("{id}", run).replace("{seq}", "0").replace("{name}", "dam-break").replace("{file}", "page.css")
         assert "{" not in url, path
         if method == "delete" and path == "/v1/runs/{id}":
             continue
@@ -125,7 +125,7 @@ def test_methods_that_the_document_lacks_are_405(daemon, document):
     for path, method, _ in operations(document):
         allowed.setdefault(path, set()).add(method.upper())
     for path, methods in allowed.items():
-        url = path.replace("{id}", run).replace("{seq}", "0").replace("{name}", "dam-break")
+        url = path.replace("{id}", run).replace("{seq}", "0").replace("{name}", "dam-break").replace("{file}", "page.css")
         for method in {"GET", "POST", "PUT", "PATCH", "DELETE"} - methods:
             reply = daemon.ask(method, url, status=405)
             assert methods <= {m.strip() for m in reply.headers["allow"].split(",")}, reply
