@@ -3,7 +3,7 @@
     make report                 SIZE=small: minutes
     make report SIZE=paper      the paper's sizes: hours; goes on where it was stopped or killed
     make report-page SIZE=paper the page of what is there; runs nothing
-    python3 bench/report SIZE [--page] [--only PREFIX]... [--jobs N] [--folder DIR]
+    python3 bench/report SIZE [--page | --runs] [--only PREFIX]... [--jobs N] [--folder DIR]
 """
 import argparse
 import pathlib
@@ -30,13 +30,14 @@ def draw(size, folder):
     everything = [c for part in PARTS for c in part.cases(size)]
     shelf = recordings.Shelf(everything, folder / "runs", size)
     parts = [(part.TITLE, part.sections(shelf)) for part in PARTS]
-    return [page.write(parts, shelf, folder, size)]
+    return page.write(parts, shelf, folder, size)
 
 
 def main():
     parser = argparse.ArgumentParser(prog="bench/report", description="what the report shows, run and drawn")
     parser.add_argument("size", nargs="?", default="small", choices=cases.SIZES)
     parser.add_argument("--page", action="store_true", help="run nothing, draw what is there")
+    parser.add_argument("--runs", action="store_true", help="draw nothing")
     parser.add_argument("--only", action="append", metavar="PREFIX", help="run the cases whose names begin so")
     parser.add_argument("--jobs", type=int, help="runs at a time (one a core)")
     parser.add_argument("--folder", help="where everything goes (build/report/SIZE)")
@@ -53,8 +54,8 @@ def main():
             print(f"ran for {time.monotonic() - began:.0f} s")
     except runs.Trouble as e:
         sys.exit(f"report: {e}")
-    for path in draw(options.size, folder):
-        print(path)
+    if not options.runs:
+        print(draw(options.size, folder))
     return 1 if troubles else 0
 
 

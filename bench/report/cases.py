@@ -3,7 +3,7 @@ report lists its own (`cases(size)` in cook.py and its neighbours)."""
 import dataclasses
 import itertools
 
-SIZES = ("small", "paper")
+SIZES = ("small", "paper", "tiny")  # tiny: for the test of the report itself, seconds and no physics
 
 BASES = {"gimp": "uGIMP", "bspline2": "quadratic B-spline", "bspline3": "cubic B-spline"}
 SCHEMES = {"standard": False, "zhao": {"scheme": "zhao"}, "anchored": {"scheme": "anchored"}}

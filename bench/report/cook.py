@@ -2,7 +2,8 @@
 import numpy as np
 
 from cases import BASES, grid, merged
-from draw import COLOURS, SCHEME, SHORT, curves, fields, plt, save
+from draw import COLOURS, SCHEME, SHORT, curves, fields, legend, plt, save
+from measure import lattice_residual, rms
 from page import Picture, Section, Table, percent
 from recordings import table
 
@@ -11,7 +12,12 @@ TITLE = "Cook's membrane"
 
 def cells(size):
     """The two discretisations, m."""
-    return {"small": (2.0, 1.0), "paper": (1.0, 0.5)}[size]
+    return {"small": (2.0, 1.0), "paper": (1.0, 0.5), "tiny": (4.0, 2.0)}[size]
+
+
+def main_cell(size):
+    """That of the paper's coarse discretisation, 5,776 particles."""
+    return 2.0 if size == "tiny" else 1.0
 
 
 def cases(size):
@@ -28,6 +34,10 @@ def cases(size):
             "references": [],
         }  # fmt: skip
         rank = 10 if cell >= 1 else 35
+        if size == "tiny":
+            tiny = merged(overrides, {"time": {"end": 40}, "domain": {"min": [-4, -4], "max": [52, 68]}})
+            made += grid(f"cook-h{cell:g}", "cook-membrane", tiny, rank, ("gimp",), cell=cell)
+            continue
         made += grid(f"cook-h{cell:g}", "cook-membrane", overrides, rank, cell=cell)
         made += grid(f"cook-h{cell:g}", "cook-membrane", merged(overrides, {"time": {"end": 40}}), rank + 1,
                      ("bspline3",), cell=cell)  # fmt: skip
@@ -80,22 +90,12 @@ class Solution:
 
     def error(self):
         """RMS of the error of the mean stress over the standard deviation of the finite elements'."""
-        e, ref = (self.p - self.p_fem)[self.counted], self.p_fem[self.counted]
-        return float(np.sqrt(np.mean(e**2)) / ref.std())
+        return rms((self.p - self.p_fem)[self.counted]) / float(self.p_fem[self.counted].std())
 
     def oscillation(self, p=None):
         """RMS of what a plane through a particle's 5 x 5 neighbours on the lattice leaves, over the same deviation."""
-        p = self.p if p is None else p
-        index = np.rint((self.X - self.X.min(axis=0)) / (self.cell / 2)).astype(int) + 2
-        grid = np.full(index.max(axis=0) + 3, np.nan)
-        grid[index[:, 0], index[:, 1]] = p
-        offsets = np.array([(i, j) for i in range(-2, 3) for j in range(-2, 3)])
-        near = grid[index[:, :1] + offsets[:, 0], index[:, 1:] + offsets[:, 1]]  # (n, 25)
-        weight = np.isfinite(near).astype(float)
-        basis = np.column_stack([np.ones(25), offsets])
-        matrix = np.einsum("nk,ka,kb->nab", weight, basis, basis)
-        fit = np.linalg.solve(matrix, np.einsum("nk,ka->na", np.nan_to_num(near), basis)[:, :, None])[:, 0, 0]
-        return float(np.sqrt(np.mean((p - fit)[self.counted] ** 2)) / self.p_fem[self.counted].std())
+        noise = lattice_residual(self.X, self.p if p is None else p, self.cell / 2)
+        return rms(noise[self.counted]) / float(self.p_fem[self.counted].std())
 
     def column(self):
         """Displacement u_y of the finite elements, mean of the loaded column of particles."""
@@ -106,7 +106,7 @@ class Solution:
 
 
 def solutions(shelf, **labels):
-    return [Solution(r) for r in shelf.find(**labels) if not r.failed]
+    return [Solution(r) for r in shelf.find(**labels) if not r.failed and r.reaches(T_FIELD)]
 
 
 def measures(shelf, basis, cells):
@@ -204,12 +204,12 @@ def figure_4(shelf):
 
 
 def figure_5(shelf):
-    there = {s.run.labels["scheme"]: s for s in solutions(shelf, basis="gimp", cell=1.0)}
+    there = {s.run.labels["scheme"]: s for s in solutions(shelf, basis="gimp", cell=main_cell(shelf.size))}
     line = []
 
     def profile(s, p):
         # the two columns of particles beside X = 24 m
-        near = abs(abs(s.X[:, 0] - 24) - 0.25) < 0.01
+        near = abs(abs(s.X[:, 0] - 24) - s.cell / 4) < 0.01
         order = np.argsort(s.X[near, 1], kind="stable")
         return s.X[near, 1][order], p[near][order]
 
@@ -221,19 +221,19 @@ def figure_5(shelf):
         line += [["FEM", float(a), float(b)] for a, b in zip(y, p)]
 
     def draw(path):
+        if not there:
+            return
         figure, (left, right) = curves((7.4, 3.4), 2)
         for scheme in ("standard", "zhao", "anchored"):
             if scheme in there:
                 for axis in (left, right):
                     axis.plot(*profile(there[scheme], there[scheme].p), ".", ms=3, color=COLOURS[scheme], label=SCHEME[scheme])
         for axis in (left, right):
-            if there:
-                axis.plot(y, p, "-", color=COLOURS["reference"], linewidth=1, label="FEM")
+            axis.plot(y, p, "-", color=COLOURS["reference"], linewidth=1, label="FEM")
             axis.set_xlabel("Y in the reference configuration (m)"), axis.set_ylabel("mean stress (Pa)")
         right.set_ylim(-0.16, 0.16)
         left.set_title("X = 24 m: all"), right.set_title("the same, nearer")
-        if there:
-            left.legend(loc="lower left")
+        legend(left, loc="lower left")
         save(figure, path)
 
     if "zhao" not in there:
@@ -282,6 +282,8 @@ def figure_6(shelf):
                 else:
                     axis.set_xlabel("t (s)")
         axes[0, 0].set_ylabel("u_y of the tip (m)"), axes[1, 0].set_ylabel("u_y, mean of the column (m)")
+        if not rows:
+            return plt.close(figure)
         handles, labels = axes[1, 0].get_legend_handles_labels()
         figure.set_layout_engine("constrained", rect=(0, 0.13, 1, 0.87))
         figure.legend(handles, labels, loc="lower center", ncols=4)
@@ -296,7 +298,7 @@ def figure_6(shelf):
                              s.run.at(T_FIELD, "column", "y") / s.column() - 1, end,
                              s.run.at(end, "column", "y") / s.column() - 1])  # fmt: skip
     found = {(r[0], r[1], r[2]): r for r in rows}
-    coarse = max(c for c in both if c <= 1) if shelf.size == "paper" else 1.0
+    coarse = main_cell(shelf.size)
     z, a, s = (found.get((SHORT["gimp"], coarse, k)) for k in ("zhao", "anchored", "standard"))
     b = found.get((SHORT["bspline2"], coarse, "standard"))
     if not (z and a and s and b):

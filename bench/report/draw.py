@@ -4,6 +4,7 @@ import io
 import matplotlib
 
 matplotlib.use("Agg")
+import matplotlib.colors as norms  # noqa: E402,F401
 import matplotlib.pyplot as plt  # noqa: E402
 import numpy as np  # noqa: E402
 from PIL import Image  # noqa: E402
@@ -22,6 +23,11 @@ plt.rcParams.update({
 })  # fmt: skip
 
 
+def plain(title):
+    """A title without mathematics, for tables."""
+    return title.replace(r"$\bar{F}$ ", "")
+
+
 def label(labels):
     return f"{SCHEME[labels['scheme']]}, {SHORT[labels['basis']]}"
 
@@ -30,7 +36,15 @@ def style(labels):
     return {"color": COLOURS[labels["scheme"]], "linestyle": STYLES[labels["basis"]]}
 
 
+def legend(axis, **options):
+    if axis.get_legend_handles_labels()[0]:
+        axis.legend(**options)
+
+
 def save(figure, path):
+    """Writes a figure; nothing where there was nothing to draw (None)."""
+    if figure is None:
+        return
     # With a palette, files are a third of the size.
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", metadata={"Software": None})
@@ -48,7 +62,9 @@ def curves(figsize=(7.2, 3.2), columns=1, **options):
 def fields(panels, limits, unit, xlim, ylim, columns, cmap="RdBu_r", width=7.6, extend="both", norm=None):
     """One panel for each of `panels`: (title, x (n, 2), value (n,), spacing), or (title, text) where there is nothing
     to show. All share limits, colours and one colour bar, labelled `unit`. A particle is drawn as a square of `spacing`
-    (m), the distance of particles in the beginning."""
+    (m), the distance of particles in the beginning. None where no panel has anything."""
+    if all(len(panel) == 2 for panel in panels):
+        return None
     rows = -(-len(panels) // columns)
     aspect = (ylim[1] - ylim[0]) / (xlim[1] - xlim[0])
     height = rows * (0.9 * width / columns * aspect + 0.3) + 0.75
@@ -64,6 +80,8 @@ def fields(panels, limits, unit, xlim, ylim, columns, cmap="RdBu_r", width=7.6, 
             axis.text(np.mean(xlim), np.mean(ylim), panel[1], ha="center", va="center", color="#777777", fontsize=7)
             continue
         _, x, value, spacing = panel
+        if norm:
+            value = np.maximum(value, norm.vmin)  # a logarithm has no 0
         scale = {"norm": norm} if norm else {"vmin": limits[0], "vmax": limits[1]}
         shown.append((axis, spacing, axis.scatter(x[:, 0], x[:, 1], c=value, cmap=cmap, marker="s", linewidths=0,
                                                   rasterized=True, **scale)))  # fmt: skip

@@ -19,7 +19,7 @@ VERDICTS = {"holds": "#1e8449", "holds in part": "#b9770e", "does not hold": "#c
 class Picture:
     file: str  # name of the PNG beside the page
     caption: str
-    draw: object  # called with the path
+    draw: object  # called with the path; writes nothing where there is nothing to show
 
 
 @dataclasses.dataclass
@@ -91,7 +91,10 @@ def write_section(section, folder):
     word, why = section.verdict
     out = [f'<section id="{section.anchor}"><h3>{html.escape(section.title)}</h3>']
     for picture in section.pictures:
+        (folder / picture.file).unlink(missing_ok=True)
         picture.draw(folder / picture.file)
+        if not (folder / picture.file).exists():
+            continue
         out.append(f'<figure><img alt="{html.escape(picture.caption)}" src="{embedded(folder / picture.file)}">'
                    f"<figcaption>{picture.caption}</figcaption></figure>")  # fmt: skip
     out.append(f"<dl><dt>The paper shows</dt><dd>{section.paper}</dd><dt>We measure</dt><dd>{section.measured}</dd></dl>")

@@ -22,14 +22,13 @@ def table(name):
 
 
 class Recording:
-    """A recording that is complete."""
+    """A recording; of a run that is still under way what `fbar record` left when it was stopped (`complete` says)."""
 
     def __init__(self, path, labels=None):
         self.path, self.name, self.labels = pathlib.Path(path), pathlib.Path(path).stem, labels or {}
         with h5py.File(path) as f:
             about = f["fbard"]
-            if not about.attrs["complete"]:
-                raise ValueError(f"{path} is not complete")
+            self.complete = bool(about.attrs["complete"])
             self.state, self.version = text(about.attrs["state"]), text(about.attrs["code_version"])
             self.dimension = int(about.attrs["dimension"])
             self.scene = json.loads(about["scene"][()])
@@ -48,6 +47,9 @@ class Recording:
         """Of a run that failed: what the daemon said."""
         error = self.run.get("error") or {}
         return error.get("detail") or error.get("kind") or self.state
+
+    def reaches(self, time):
+        return self.times[-1] >= time - 1e-3 * abs(time)
 
     def nearest(self, time):
         """Index of the frame nearest to a time."""
@@ -99,10 +101,11 @@ class Shelf:
     def get(self, name):
         return self._there.get(name)
 
-    def find(self, **labels):
-        """All recordings whose case carries these labels, in the order of the cases."""
+    def find(self, partial=False, **labels):
+        """All recordings whose case carries these labels, in the order of the cases; with `partial` also those of
+        runs that are not over."""
         return [self._there[c.name] for c in self.cases
-                if c.name in self._there and all(c.labels.get(k) == v for k, v in labels.items())]  # fmt: skip
+                if c.name in self._there and (partial or self._there[c.name].complete) and all(c.labels.get(k) == v for k, v in labels.items())]  # fmt: skip
 
     def missing(self, prefix=""):
-        return [c.name for c in self.cases if c.name.startswith(prefix) and c.name not in self._there]
+        return [c.name for c in self.cases if c.name.startswith(prefix) and not (c.name in self._there and self._there[c.name].complete)]
