@@ -348,12 +348,11 @@ MPM_KERNEL mpm_vec mpm_splat_two(const double *one, const double *other, const i
                       : _mm256_blend_pd(_mm256_set1_pd(*one), _mm256_set1_pd(*other), 12);
 #endif
 }
-// Lanes 6 and 7 of eight added to 4 and 5, and 0 in their place.
+// Lanes 6 and 7 of eight added to 4 and 5; what they then hold is not for use.
 MPM_KERNEL mpm_vec mpm_join_pairs(mpm_vec a, const int part) {
 #if MPM_LANES == 8
     (void)part;
-    const __m512d swapped = _mm512_permutex_pd(a, 0x4e);
-    return _mm512_maskz_mov_pd(0x3f, _mm512_mask_add_pd(a, 0x30, a, swapped));
+    return _mm512_mask_add_pd(a, 0x30, a, _mm512_permutex_pd(a, 0x4e));
 #else
     if (part == 0) {
         return a;
@@ -384,16 +383,40 @@ MPM_KERNEL mpm_mask mpm_from_lane(int lane) {
     return (mpm_mask)mpm_lane_range(lane, 4);
 #endif
 }
-// Bit i: number[i] differs from number[i - 1], for 64 numbers.
-MPM_KERNEL uint64_t mpm_changes_64(const int32_t *number) {
-    uint64_t bits = 0;
-    for (int i = 0; i < 64; i += 8) {
-        const __m256i now = _mm256_loadu_si256((const __m256i *)(const void *)(number + i));
-        const __m256i before = _mm256_loadu_si256((const __m256i *)(const void *)(number + i - 1));
-        const __m256 same = _mm256_castsi256_ps(_mm256_cmpeq_epi32(now, before));
-        bits |= (uint64_t)(~(unsigned)_mm256_movemask_ps(same) & 0xffu) << i;
-    }
-    return bits;
+// from[0], from[0], from[1], from[1], ...
+MPM_KERNEL mpm_vec mpm_load_twice(const double *from) {
+#if MPM_LANES == 8
+    return _mm512_permutexvar_pd(_mm512_set_epi64(3, 3, 2, 2, 1, 1, 0, 0),
+                                 _mm512_castpd256_pd512(_mm256_load_pd(from)));
+#else
+    return _mm256_permute4x64_pd(_mm256_castpd128_pd256(_mm_load_pd(from)), 0x50);
+#endif
+}
+// *one in even lanes, *other in odd ones.
+MPM_KERNEL mpm_vec mpm_splat_pair(const double *one, const double *other) {
+#if MPM_LANES == 8
+    return _mm512_mask_broadcastsd_pd(_mm512_set1_pd(*one), 0xaa, _mm_load_sd(other));
+#else
+    return _mm256_blend_pd(_mm256_set1_pd(*one), _mm256_set1_pd(*other), 10);
+#endif
+}
+// to[0], to[1] += lanes 2 pair, 2 pair + 1.
+MPM_KERNEL void mpm_add_pair(double *to, mpm_vec a, const int pair) {
+#if MPM_LANES == 8
+    const __m256d half = pair < 2 ? _mm512_castpd512_pd256(a) : _mm512_extractf64x4_pd(a, 1);
+#else
+    const __m256d half = a;
+#endif
+    const __m128d two = pair % 2 ? _mm256_extractf128_pd(half, 1) : _mm256_castpd256_pd128(half);
+    _mm_store_pd(to, _mm_load_pd(to) + two);
+}
+// The lanes of b one place up, behind the last one of a.
+MPM_KERNEL mpm_vec mpm_follow(mpm_vec a, mpm_vec b) {
+#if MPM_LANES == 8
+    return (mpm_vec)_mm512_alignr_epi64((__m512i)b, (__m512i)a, 7);
+#else
+    return _mm256_shuffle_pd(_mm256_permute2f128_pd(a, b, 0x21), b, 5);
+#endif
 }
 // out[i] = from[which[i]] + plus[i], eight at a time, of eight to choose from.
 MPM_KERNEL void mpm_pick_8(const uint32_t *from, const uint8_t *which, const uint8_t *plus,

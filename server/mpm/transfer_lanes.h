@@ -106,22 +106,19 @@ MPM_KERNEL mpm_vec fetch(struct extent in, int lane, double *field, int n_compon
 
 // ---- Weights ----
 
-// Runs begin where the cell is not the one before.
-MPM_KERNEL void find_runs(struct batch *b, const int32_t *key) {
+// Runs begin where the cell is not the one before: `begins` has a bit for each lane.
+MPM_KERNEL void find_runs(struct batch *b, uint64_t *begins, const int32_t *key) {
     const struct extent in = b->in;
-    uint64_t begins = mpm_changes_64(key);
-    begins = (begins | (uint64_t)1 << in.begin) & UINT64_MAX << in.begin;
-    begins &= in.end < 64 ? ~(UINT64_MAX << in.end) : UINT64_MAX;
     int n = 0;
-    for (; begins; begins &= begins - 1) {
-        b->run[n++] = __builtin_ctzll(begins);
-    }
-    for (int lane = 64; lane < in.end; lane++) {
-        b->run[n] = lane;
-        n += key[lane] != key[lane - 1];
-    }
-    for (int r = 0; r < n; r++) {
-        b->key[r] = (uint32_t)key[b->run[r]];
+    begins[0] = (begins[0] | (uint64_t)1 << in.begin) & UINT64_MAX << in.begin;
+    for (int word = 0; word <= (in.end - 1) / 64; word++) {
+        const int left = in.end - word * 64;
+        uint64_t bits = begins[word] & (left < 64 ? ~(UINT64_MAX << left) : UINT64_MAX);
+        for (; bits; bits &= bits - 1) {
+            const int lane = word * 64 + __builtin_ctzll(bits);
+            b->run[n] = lane;
+            b->key[n++] = (uint32_t)key[lane];
+        }
     }
     b->n_runs = n;
     b->run[n] = in.end;
@@ -133,8 +130,9 @@ MPM_KERNEL void find_cells(struct batch *b, const struct mpm_span *span, const i
     const struct mpm_particles part = *span->s, *s = &part;
     const struct mpm_grid grid = *span->grid, *g = &grid;
     const struct extent in = b->in;
-    int32_t keys[1 + ROOM], *const key = keys + 1; // one before, which find_runs compares with
-    keys[0] = -1;
+    int32_t key[ROOM];
+    uint64_t begins[2] = {0};
+    mpm_vec before = mpm_splat(-1);
     for (int lane = 0; lane < in.end; lane += MPM_LANES) {
         mpm_vec block = mpm_splat(0), cell = mpm_splat(0);
         UNROLL for (int d = 0; d < dim; d++) {
@@ -149,9 +147,13 @@ MPM_KERNEL void find_cells(struct batch *b, const struct mpm_span *span, const i
             cell = d == 0 ? inner : cell * (double)MPM_EDGE + inner;
             mpm_store_aligned(&b->t[d][lane], xi - base);
         }
-        mpm_store_int32(&key[lane], block * (double)MPM_BLOCK_NODES(dim) + cell);
+        const mpm_vec number = block * (double)MPM_BLOCK_NODES(dim) + cell;
+        begins[lane / 64] |= (uint64_t)mpm_bits(number != mpm_follow(before, number))
+                             << lane % 64;
+        before = number;
+        mpm_store_int32(&key[lane], number);
     }
-    find_runs(b, key);
+    find_runs(b, begins, key);
 }
 
 // The weights of all particles, for the stages that take one particle after another.
@@ -310,48 +312,47 @@ MPM_KERNEL void gather_at(const struct batch *b, int lane, const struct mpm_part
     }
 }
 
-// A vector mostly has particles of one cell or of two, seldom of more.
+// A vector mostly has particles of one cell or of two, seldom of more: then it is gathered again
+// for the next two, from their first lane on.
+MPM_KERNEL void keep_gathered(double *to, mpm_vec a, int from) {
+    if (from == 0) {
+        mpm_store_aligned(to, a);
+    } else {
+        mpm_store_lanes(to, a, from, MPM_LANES);
+    }
+}
 MPM_KERNEL void gather(struct batch *b, const struct mpm_span *span, const int dim,
                        const enum mpm_basis basis, const int scalars) {
     const struct extent in = b->in;
     const struct mpm_particles part = *span->s, *s = &part;
     const struct mpm_grid grid = *span->grid, *g = &grid;
-    const int n = scalars == 0 ? 2 * dim + dim * dim : scalars;
     int run = 0; // the one that the vector begins in
     for (int lane = in.begin / MPM_LANES * MPM_LANES; lane < in.end; lane += MPM_LANES) {
-        mpm_vec out[6 + 9];
-        for (int from = 0; from < MPM_LANES;) { // once, but for vectors of more than two cells
-            mpm_vec piece[6 + 9];
+        for (int from = 0; from < MPM_LANES;) {
+            mpm_vec out[6 + 9];
             const int next = run + 1 < b->n_runs ? b->run[run + 1] - lane : MPM_LANES;
             if (next >= MPM_LANES) {
                 gather_at(b, lane, s, g, b->nodes[run], b->nodes[run], mpm_from_lane(MPM_LANES),
-                          false, piece, dim, basis, scalars);
+                          false, out, dim, basis, scalars);
             } else {
                 gather_at(b, lane, s, g, b->nodes[run], b->nodes[run + 1], mpm_from_lane(next), true,
-                          piece, dim, basis, scalars);
+                          out, dim, basis, scalars);
                 run++;
             }
-            const mpm_mask of = mpm_from_lane(from);
-            UNROLL for (int k = 0; k < n; k++) {
-                out[k] = from > 0 ? mpm_select(of, piece[k], out[k]) : piece[k];
+            UNROLL for (int k = 0; k < scalars; k++) {
+                keep_gathered(&b->ratio[k][lane], out[k], from);
+            }
+            UNROLL for (int d = 0; scalars == 0 && d < dim; d++) {
+                keep_gathered(&b->v[d][lane], out[d], from);
+                keep_gathered(&b->dv[d][lane], out[dim + d], from);
+                UNROLL for (int e = 0; e < dim; e++) {
+                    keep_gathered(&b->l[d * dim + e][lane], out[2 * dim + d * dim + e], from);
+                }
             }
             from = run + 1 < b->n_runs ? b->run[run + 1] - lane : MPM_LANES;
             run += from < MPM_LANES;
         }
         run += run + 1 < b->n_runs && b->run[run + 1] == lane + MPM_LANES;
-        if (scalars > 0) {
-            UNROLL for (int k = 0; k < scalars; k++) {
-                mpm_store_aligned(&b->ratio[k][lane], out[k]);
-            }
-            continue;
-        }
-        UNROLL for (int d = 0; d < dim; d++) {
-            mpm_store_aligned(&b->v[d][lane], out[d]);
-            mpm_store_aligned(&b->dv[d][lane], out[dim + d]);
-            UNROLL for (int e = 0; e < dim; e++) {
-                mpm_store_aligned(&b->l[d * dim + e][lane], out[2 * dim + d * dim + e]);
-            }
-        }
     }
 }
 
@@ -452,37 +453,65 @@ MPM_KERNEL void scatter_records(const struct batch *b, const struct mpm_grid *g,
 
 // eq. 19: what F-bar averages, b->ratio, to the nodes; the nodes of a row lie in lanes.
 MPM_KERNEL void scatter_ratios(struct batch *b, const struct mpm_grid *g, const int dim,
-                               const enum mpm_basis basis, const int scalars) {
+                               const enum mpm_basis basis) {
     const int support = mpm_support(basis), planes = dim == 3 ? support : 1;
     for (int r = 0; r < b->n_runs; r++) {
-        const uint32_t *nodes = b->nodes[r];
-        const int begin = b->run[r], end = b->run[r + 1];
-        for (int k = 0; k < scalars; k++) {
-            mpm_four sum[MPM_MAX_SUPPORT][MPM_MAX_SUPPORT];
+        mpm_four sum[MPM_MAX_SUPPORT][MPM_MAX_SUPPORT];
+        UNROLL for (int a = 0; a < support; a++) {
+            UNROLL for (int i = 0; i < planes; i++) {
+                sum[a][i] = (mpm_four){0};
+            }
+        }
+        for (int p = b->run[r]; p < b->run[r + 1]; p++) {
+            const mpm_four of = mpm_load_four(b->row[p]) * b->ratio[0][p];
+            UNROLL for (int a = 0; a < support; a++) {
+                const mpm_four plane = of * b->w[0][a][p];
+                UNROLL for (int i = 0; i < planes; i++) {
+                    sum[a][i] = dim == 3 ? sum[a][i] + plane * b->w[1][i][p] : sum[a][i] + plane;
+                }
+            }
+        }
+        const uint32_t *row = b->nodes[r];
+        UNROLL for (int a = 0; a < support; a++) {
+            UNROLL for (int i = 0; i < planes; i++, row += support) {
+                UNROLL for (int c = 0; c < support; c++) {
+                    g->fbar[row[c]] += sum[a][i][c];
+                }
+            }
+        }
+    }
+}
+
+// The same of the anchored scheme's two scalars: in lanes node by node, the two of a node together.
+MPM_KERNEL void scatter_pairs(struct batch *b, const struct mpm_grid *g, const int dim,
+                              const enum mpm_basis basis) {
+    const int support = mpm_support(basis), planes = dim == 3 ? support : 1;
+    const int part_nodes = MPM_LANES / 2, parts = (support + part_nodes - 1) / part_nodes;
+    for (int r = 0; r < b->n_runs; r++) {
+        UNROLL for (int part = 0; part < parts; part++) {
+            mpm_vec sum[MPM_MAX_SUPPORT][MPM_MAX_SUPPORT];
             UNROLL for (int a = 0; a < support; a++) {
                 UNROLL for (int i = 0; i < planes; i++) {
-                    sum[a][i] = (mpm_four){0};
+                    sum[a][i] = mpm_splat(0);
                 }
             }
-            for (int p = begin; p < end; p++) {
-                const mpm_four of = mpm_load_four(b->row[p]) * b->ratio[k][p];
+            for (int p = b->run[r]; p < b->run[r + 1]; p++) {
+                const mpm_vec of = mpm_load_twice(b->row[p] + part * part_nodes) *
+                                   mpm_splat_pair(b->ratio[0] + p, b->ratio[1] + p);
                 UNROLL for (int a = 0; a < support; a++) {
-                    const double wa = b->w[0][a][p];
-                    if (dim == 2) {
-                        sum[a][0] += of * wa;
-                        continue;
-                    }
-                    const mpm_four plane = of * wa;
-                    UNROLL for (int i = 0; i < support; i++) {
-                        sum[a][i] += plane * b->w[1][i][p];
+                    const mpm_vec plane = of * b->w[0][a][p];
+                    UNROLL for (int i = 0; i < planes; i++) {
+                        sum[a][i] = dim == 3 ? sum[a][i] + plane * b->w[1][i][p] : sum[a][i] + plane;
                     }
                 }
             }
-            const uint32_t *row = nodes;
+            const uint32_t *row = b->nodes[r] + part * part_nodes;
             UNROLL for (int a = 0; a < support; a++) {
                 UNROLL for (int i = 0; i < planes; i++, row += support) {
-                    UNROLL for (int c = 0; c < support; c++) {
-                        g->fbar[(size_t)row[c] * (size_t)scalars + (size_t)k] += sum[a][i][c];
+                    UNROLL for (int c = 0; c < part_nodes; c++) {
+                        if (part * part_nodes + c < support) {
+                            mpm_add_pair(g->fbar + (size_t)row[c] * 2, sum[a][i], c);
+                        }
                     }
                 }
             }
@@ -1032,9 +1061,9 @@ MPM_KERNEL void g2p(const struct mpm_span *span, struct mpm_span_result *r, cons
             find_rows(&b, dim, basis);
         }
         if (scheme == MPM_FBAR_ZHAO) {
-            scatter_ratios(&b, span->grid, dim, basis, 1);
+            scatter_ratios(&b, span->grid, dim, basis);
         } else if (scheme == MPM_FBAR_ANCHORED) {
-            scatter_ratios(&b, span->grid, dim, basis, 2);
+            scatter_pairs(&b, span->grid, dim, basis);
         }
     }
     found_all(&found, r, dim);
