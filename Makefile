@@ -74,8 +74,8 @@ levels = $(foreach level,$(LEVELS),$(patsubst %.c,$(B)/obj/%.$(level).o,$(1)))
 lanes = $(call obj,$(1)) $(call levels,$(1))
 $(B)/obj/server/mpm/kernels.o: ALL_CFLAGS += $(if $(LEVELS),-DMPM_HAS_LANES)
 # Written in vectors: what the compiler would vectorise or unroll besides is scalar for a reason.
-$(call levels,$(LANES_SRC)): ALL_CFLAGS += $(if $(filter asan tsan debug coverage,$(VARIANT)),-O1,-O2) \
-	-fno-tree-vectorize -fno-tree-slp-vectorize
+LANES_FLAGS = $(if $(filter asan tsan debug coverage,$(VARIANT)),-O1,-O2) -fno-tree-vectorize -fno-tree-slp-vectorize
+$(call levels,$(LANES_SRC)): ALL_CFLAGS += $(LANES_FLAGS)
 
 .PHONY: all programs deps deps-long deps-report libmpm demo report report-page check check-all check-layers check-unit check-physics check-api \
 	check-cli check-loss check-asan check-clang check-fuzz check-tsan unit-programs check-long bench bench-solver bench-peer \
@@ -163,10 +163,13 @@ $(B)/tests/%: $(B)/obj/tests/%.o $(SERVER_OBJ) $(call obj,$(PROTO_SRC)) $(B)/lib
 	@mkdir -p $(@D)
 	$(Q)$(CC) $(ALL_LDFLAGS) -pthread $(OPENMP) $^ $(call pc_libs,$(SERVER_LIBS) cmocka) -lm -o $@
 
-$(B)/obj/bench/%.o: ALL_CFLAGS += $(OPENMP) -Wno-missing-prototypes
-$(B)/bench-solver: $(B)/obj/bench/solver.o $(B)/libmpm.a
+BENCH_LANES = $(call levels,bench/stages_2d.c bench/stages_3d.c)
+BENCH_OBJ = $(call obj,$(addprefix bench/,solver.c stages.c scenes.c)) $(BENCH_LANES)
+$(B)/obj/bench/%.o: ALL_CFLAGS += $(call pc_cflags,$(SERVER_LIBS)) $(OPENMP) $(if $(LEVELS),-DMPM_HAS_LANES) -Wno-missing-prototypes
+$(BENCH_LANES): ALL_CFLAGS += $(LANES_FLAGS)
+$(B)/bench-solver: $(BENCH_OBJ) $(SERVER_OBJ) $(call obj,$(PROTO_SRC)) $(B)/libmpm.a
 	$(call say,LD,$@)
-	$(Q)$(CC) $(ALL_LDFLAGS) $(OPENMP) $^ -lm -o $@
+	$(Q)$(CC) $(ALL_LDFLAGS) -pthread $(OPENMP) $^ $(call pc_libs,$(SERVER_LIBS)) -lm -o $@
 
 # Fuzz targets: tests/fuzz/fuzz_*.c, driven by libFuzzer in VARIANT=fuzz, else by replay.c.
 FUZZ = $(patsubst tests/%.c,$(B)/tests/%,$(sort $(wildcard tests/fuzz/fuzz_*.c)))
@@ -208,14 +211,15 @@ check-all: all
 check-layers: all
 	$(Q)tests/layers.sh
 
+SPIN = 2000 # as fbard has it: threads that outnumber the cores give way to each other
 LEFT_OUT = # names of unit tests that are not run
 UNIT_RUN = $(filter-out $(LEFT_OUT:%=$(B)/tests/unit/test_%),$(UNIT))
 unit-programs: $(UNIT_RUN)
 check-unit: $(UNIT_RUN) ## cmocka tests of every module
-	$(Q)set -e; for t in $^; do echo "== $$t"; $$t; done
+	$(Q)set -e; export GOMP_SPINCOUNT=$(SPIN); for t in $^; do echo "== $$t"; $$t; done
 
 check-physics: $(PHYSICS) ## the solver against exact solutions and published values
-	$(Q)set -e; for t in $^; do echo "== $$t"; $$t; done
+	$(Q)set -e; export GOMP_SPINCOUNT=$(SPIN); for t in $^; do echo "== $$t"; $$t; done
 
 PYTEST = $(PYTHON) -m pytest -q -p no:cacheprovider
 
@@ -277,7 +281,7 @@ check-long: deps-long deps-report ## the longer verification: minutes to hours
 bench: bench-solver bench-recording bench-status ## speed: the kernels, what recording costs, how fast the daemon answers
 
 bench-solver: $(B)/bench-solver ## kernels against the plain ones, ratios and growth; JSON in build/bench.json
-	$(Q)$< --json build/bench.json $(BENCH)
+	$(Q)GOMP_SPINCOUNT=$(SPIN) $< --json build/bench.json $(BENCH)
 
 bench-peer: ## how to run the same block problem with another code
 	@cat docs/peers.md

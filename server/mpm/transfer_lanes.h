@@ -23,6 +23,14 @@
 #error "the plain kernels are server/mpm/transfer.c"
 #endif
 
+// bench/stages.c leaves stages out to see what each takes; elsewhere nothing of this is there.
+#ifdef MPM_STAGES
+extern int MPM_STAGES;
+#define STAGE(n) if (MPM_STAGES >= (n))
+#else
+#define STAGE(n)
+#endif
+
 #define BATCH 64                // particles
 #define MOST (BATCH + MPM_BLOCK) // of the last batch of a span, which takes what would be left over
 #define ROOM (MOST + 8)          // whole vectors, rows of cache lines
@@ -998,11 +1006,11 @@ MPM_KERNEL void p2g(const struct mpm_span *span, struct mpm_span_result *r, cons
     struct batch b;
     *r = mpm_nothing_found();
     FOR_BATCHES(&b, span) {
-        find_cells(&b, span, dim, basis);
-        find_nodes(&b, span->grid, dim, basis);
-        write_weights(&b, span->s, dim, basis, true);
-        write_records(&b, span, dim);
-        scatter_records(&b, span->grid, dim, basis);
+        STAGE(1) find_cells(&b, span, dim, basis);
+        STAGE(2) find_nodes(&b, span->grid, dim, basis);
+        STAGE(3) write_weights(&b, span->s, dim, basis, true);
+        STAGE(4) write_records(&b, span, dim);
+        STAGE(5) scatter_records(&b, span->grid, dim, basis);
         r->n_runs += (uint32_t)b.n_runs;
     }
 }
@@ -1052,18 +1060,22 @@ MPM_KERNEL void g2p(const struct mpm_span *span, struct mpm_span_result *r, cons
     found_nothing(&found);
     *r = mpm_nothing_found();
     FOR_BATCHES(&b, span) {
-        find_cells(&b, span, dim, basis);
-        find_nodes(&b, span->grid, dim, basis);
-        gather(&b, span, dim, basis, 0);
-        update_batch(&b, span, r, &found);
-        if (scheme != MPM_FBAR_OFF) {
-            write_weights(&b, span->s, dim, basis, false);
-            find_rows(&b, dim, basis);
+        STAGE(1) find_cells(&b, span, dim, basis);
+        STAGE(2) find_nodes(&b, span->grid, dim, basis);
+        STAGE(3) gather(&b, span, dim, basis, 0);
+        STAGE(4) update_batch(&b, span, r, &found);
+        STAGE(5) {
+            if (scheme != MPM_FBAR_OFF) {
+                write_weights(&b, span->s, dim, basis, false);
+                find_rows(&b, dim, basis);
+            }
         }
-        if (scheme == MPM_FBAR_ZHAO) {
-            scatter_ratios(&b, span->grid, dim, basis);
-        } else if (scheme == MPM_FBAR_ANCHORED) {
-            scatter_pairs(&b, span->grid, dim, basis);
+        STAGE(6) {
+            if (scheme == MPM_FBAR_ZHAO) {
+                scatter_ratios(&b, span->grid, dim, basis);
+            } else if (scheme == MPM_FBAR_ANCHORED) {
+                scatter_pairs(&b, span->grid, dim, basis);
+            }
         }
     }
     found_all(&found, r, dim);
@@ -1077,10 +1089,10 @@ MPM_KERNEL void fbar(const struct mpm_span *span, struct mpm_span_result *r, con
     found_nothing(&found);
     *r = mpm_nothing_found();
     FOR_BATCHES(&b, span) {
-        find_cells(&b, span, dim, basis);
-        find_nodes(&b, span->grid, dim, basis);
-        gather(&b, span, dim, basis, scalars);
-        finish_batch(&b, span, r, &found);
+        STAGE(1) find_cells(&b, span, dim, basis);
+        STAGE(2) find_nodes(&b, span->grid, dim, basis);
+        STAGE(3) gather(&b, span, dim, basis, scalars);
+        STAGE(4) finish_batch(&b, span, r, &found);
     }
     found_all(&found, r, dim);
 }
@@ -1112,7 +1124,13 @@ MPM_KERNEL void move_nodes(const struct mpm_grid *grid, uint32_t begin, uint32_t
     }
 }
 
+#ifdef MPM_STAGES
+#define BASES(X) X(BSPLINE2)
+#define NAME_OF(isa, dim) bench_kernels_##isa##_##dim##d
+#else
 #define BASES(X) X(LINEAR) X(GIMP) X(BSPLINE2) X(BSPLINE3)
+#define NAME_OF(isa, dim) mpm_kernels_##isa##_##dim##d
+#endif
 #define DEFINE(B)                                                                                  \
     static void p2g_##B(const struct mpm_span *span, struct mpm_span_result *r) {                  \
         p2g(span, r, DIM, MPM_##B);                                                                \
@@ -1137,7 +1155,6 @@ static void move_nodes_of(const struct mpm_grid *grid, uint32_t begin, uint32_t 
 #define ENTRY(B)                                                                                   \
     [MPM_##B] = {                                                                                  \
         .p2g = p2g_##B, .move_nodes = move_nodes_of, .g2p = g2p_##B, .fbar = fbar_##B},
-#define NAME_OF(isa, dim) mpm_kernels_##isa##_##dim##d
 #define NAME(isa, dim) NAME_OF(isa, dim)
 #if MPM_LANES == 4
 const struct mpm_kernels NAME(avx2, DIM)[MPM_N_BASES] = {BASES(ENTRY)};

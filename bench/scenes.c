@@ -1,0 +1,177 @@
+// The paper's moving scenes, whole, as a user runs them: how fast, whether the speed lasts, what
+// the phases take, and how well two threads share the work once the particles lie scattered.
+#include "bench/bench.h"
+#include "server/scene.h"
+
+#define MOMENTS 3 // states that are kept on the way
+
+struct run {
+    struct scene *scene;
+    struct mpm_sim *sim;
+};
+
+static struct run open_scene(const char *name, const char *patch_text, int n_threads) {
+    struct run run = {0};
+    struct faults faults = {0};
+    cJSON *bare = scene_builtin(name), *patch = json_parse(patch_text, strlen(patch_text), &faults);
+    cJSON *json = json_merge_patch(bare, patch);
+    struct mpm_error err = {0};
+    run.scene = scene_create(json, &faults);
+    if (run.scene) {
+        struct mpm_def *def = scene_def(run.scene);
+        def->n_threads = n_threads;
+        def->clock = now;
+        if (mpm_create(def, &run.sim, &err)) {
+            printf("FAILED: %s: %s %s\n", name, err.pointer, err.message);
+        }
+    } else {
+        printf("FAILED: %s: %s %s\n", name, faults.items[0].pointer, faults.items[0].detail);
+    }
+    faults_free(&faults);
+    cJSON_Delete(json);
+    cJSON_Delete(patch);
+    cJSON_Delete(bare);
+    return run;
+}
+
+static void close_run(struct run *run) {
+    mpm_free(run->sim);
+    scene_free(run->scene);
+}
+
+// The same scene, from a state on.
+static struct run continue_scene(const char *name, const char *patch, int n_threads,
+                                 const void *state, size_t bytes) {
+    struct run run = open_scene(name, patch, n_threads);
+    struct mpm_error err;
+    if (run.sim && mpm_state_load(run.sim, state, bytes, &err)) {
+        printf("FAILED: %s: %s\n", name, err.message);
+        mpm_free(run.sim);
+        run.sim = NULL;
+    }
+    return run;
+}
+
+// Of the particle-steps' rate, two states in turns: `at` least the ratio asked for.
+static void compare(const char *name, const char *patch, const char *what, void *const *state,
+                    const size_t *bytes, int one, int one_threads, int other, int other_threads,
+                    double at_most) {
+    struct run a = continue_scene(name, patch, one_threads, state[one], bytes[one]);
+    struct run b = continue_scene(name, patch, other_threads, state[other], bytes[other]);
+    if (a.sim && b.sim) {
+        double ns;
+        const double ratio = pair_of(a.sim, b.sim, &ns);
+        char text_of[100];
+        snprintf(text_of, sizeof text_of, "%s: %s", name, what);
+        verdict_row("scenes", text_of, ns, ratio, at_most);
+        number("particles", (double)mpm_n_particles(a.sim));
+        close_row();
+    }
+    close_run(&a);
+    close_run(&b);
+}
+
+// `spread`: a time when two threads are asked to share the work well.
+static void whole_scene(const char *name, const char *patch, double spread) {
+    struct run run = open_scene(name, patch, 1);
+    if (!run.sim) {
+        close_run(&run);
+        return;
+    }
+    const double first = mpm_time(run.sim), all = mpm_end_time(run.sim) - first;
+    const double moments[MOMENTS] = {first + 0.05 * all, spread, first + 0.95 * all};
+    void *state[MOMENTS] = {0};
+    size_t bytes[MOMENTS] = {0}, n = mpm_n_particles(run.sim);
+    double rate[10], since = now(), begin = since;
+    uint64_t steps = 0;
+    int tenth = 0, moment = 0;
+    struct mpm_error err = {0};
+    while (!mpm_finished(run.sim)) {
+        if (mpm_step(run.sim, &err)) {
+            printf("FAILED: %s: %s\n", name, err.message);
+            break;
+        }
+        const double t = mpm_time(run.sim);
+        if (moment < MOMENTS && t >= moments[moment]) {
+            bytes[moment] = mpm_state_bytes(run.sim);
+            state[moment] = malloc(bytes[moment]);
+            mpm_state_save(run.sim, state[moment++]);
+        }
+        if (tenth < 10 && t - first >= (tenth + 1) * all * 0.1 - 1e-12) {
+            const uint64_t done = mpm_step_count(run.sim) - steps;
+            rate[tenth++] = 1e-6 * (double)done * (double)n / (now() - since);
+            steps += done;
+            since = now();
+        }
+    }
+    const double wall = now() - begin;
+    steps = mpm_step_count(run.sim);
+    printf("%s: %zu particles, %llu steps in %.1f s on one thread, %.1f M particle-steps/s; by tenths",
+           name, n, (unsigned long long)steps, wall, 1e-6 * (double)steps * (double)n / wall);
+    open_row("scenes");
+    text("scene", name);
+    number("particles", (double)n);
+    number("steps", (double)steps);
+    number("wall_s", wall);
+    for (int k = 0; k < tenth; k++) {
+        char key[20];
+        printf(" %.1f", rate[k]);
+        snprintf(key, sizeof key, "rate_%d", k + 1);
+        number(key, rate[k]);
+    }
+    printf("\n  phases, %% of wall:");
+    double sum = 0;
+    for (int k = 0; k < MPM_N_PHASES; k++) {
+        const double share = 100 * mpm_phase_seconds(run.sim, (enum mpm_phase)k) / wall;
+        printf(" %s %.1f", mpm_phase_name((enum mpm_phase)k), share);
+        number(mpm_phase_name((enum mpm_phase)k), share);
+        sum += share;
+    }
+    printf(", together %.1f\n", sum);
+    number("all_phases", sum);
+    close_row();
+    close_run(&run);
+    if (moment == MOMENTS) {
+        compare(name, patch, "ns in the last tenth / in the first", state, bytes, 2, 1, 0, 1, 1 / 0.9);
+        const double loss = clock_loss();
+        printf("  both cores at work, multiply-adds take %.2f of their time alone\n", loss);
+        compare(name, patch, "spread out, two threads / one", state, bytes, 1, 2, 1, 1, loss / 1.7);
+    }
+    for (int k = 0; k < MOMENTS; k++) {
+        free(state[k]);
+    }
+}
+
+// What of the landslide in 3D fits a benchmark: its first steps, and what the whole would take.
+static void landslide(void) {
+    const double steps = (5.5 + 0.8) / 5e-5;
+    for (int threads = 1; threads <= 2; threads++) {
+        struct run run = open_scene("landslide", "{}", threads);
+        if (run.sim) {
+            const double n = (double)mpm_n_particles(run.sim);
+            timed(run.sim, 0.3);
+            const double ns = 1e9 * timed(run.sim, quick ? 0.3 : 3), hours = 1e-9 * ns * n * steps / 3600;
+            printf("landslide: %.0f particles, %d thread%s: %.1f ns, %.1f M particle-steps/s: the "
+                   "whole of %.0f steps in %.2f h (asked for: 1.5 h on two)\n",
+                   n, threads, threads > 1 ? "s" : "", ns, 1e3 / ns, steps, hours);
+            open_row("scenes");
+            text("scene", "landslide");
+            number("particles", n);
+            number("threads", threads);
+            number("ns_per_particle_step", ns);
+            number("hours", hours);
+            close_row();
+        }
+        close_run(&run);
+    }
+}
+
+void scenes(void) {
+    if (!wanted("scenes")) {
+        return;
+    }
+    puts("\nScenes");
+    whole_scene("dam-break", quick ? "{\"time\":{\"end\":0.7}}" : "{}", 0.6);
+    whole_scene("landslide-slice", quick ? "{\"time\":{\"end\":1.6}}" : "{}", quick ? 1.3 : 2.5);
+    landslide();
+}
