@@ -103,6 +103,11 @@ bool journal_frame_at_step(struct journal *journal, uint64_t step, struct journa
 // there is no such frame or it fails its digest.
 int journal_frame_open(struct journal *journal, uint64_t seq, struct journal_frame *out, char *why);
 
+// The frame itself, checked, from malloc; NULL where journal_frame_open would give -1, or without
+// memory.
+unsigned char *journal_frame_read(struct journal *journal, uint64_t seq, struct journal_frame *out,
+                                  char *why);
+
 // A frame in the journal as memory that the file stands behind, so that who still waits to send it
 // holds none of the process's own. It stays readable when its segment goes.
 struct journal_map {

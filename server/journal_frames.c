@@ -19,6 +19,7 @@
 #define SEGMENT_MAGIC "FBARSEG1"
 #define RECORD_MAGIC "FREC"
 #define SEGMENT_MAX ((uint64_t)64 << 20) // a new segment beyond this; the unit of dropping
+#define PIECE ((size_t)256 << 10)        // bytes read at a time
 #define SEGMENTS_MIN 8 // of one budget, so that dropping frees an eighth of it at most
 
 // ---- Frames: reading back ---------------------------------------------------------------------
@@ -64,37 +65,100 @@ static struct journal_frame record_frame(const unsigned char *record,
     return info;
 }
 
-// Whether a whole record header stands anywhere in [from, bytes): then what lies before is no torn
-// tail.
-static bool record_follows(const unsigned char *map, uint64_t from, uint64_t bytes) {
-    while (from + JOURNAL_HEADER <= bytes) {
-        const unsigned char *hit = memmem(map + from, bytes - from, RECORD_MAGIC, 4);
-        if (hit == NULL || (uint64_t)(hit - map) + JOURNAL_HEADER > bytes)
-            return false;
-        if (journal_header_whole(hit, RECORD_MAGIC, 4))
-            return true;
-        from = (uint64_t)(hit - map) + 1;
+// Whether the frame at info->offset is what its digest says; read in pieces.
+static int frame_check(int fd, const struct journal_frame *info, const char *path, char *why) {
+    unsigned char preamble[FRAME_PREAMBLE];
+    unsigned char *piece = malloc(PIECE);
+    XXH3_state_t *state = XXH3_createState();
+    struct frame_view view;
+    char reason[128];
+    int error = piece == NULL || state == NULL ? ENOMEM : 0;
+    if (error == 0)
+        error = journal_read_at(fd, preamble, sizeof preamble, info->offset);
+    size_t head = error == 0 ? frame_peek_bytes(preamble) : 0;
+    bool whole = error == 0 && head > 0 && head <= info->bytes;
+    unsigned char *text = whole ? malloc(head) : NULL;
+    if (whole && text == NULL)
+        error = ENOMEM;
+    if (text != NULL)
+        error = journal_read_at(fd, text, head, info->offset);
+    snprintf(reason, sizeof reason, "does not begin with " FRAME_MAGIC);
+    whole = text != NULL && error == 0 && frame_peek(text, head, &view, reason, sizeof reason) == 0;
+    if (whole && view.total_bytes != info->bytes) {
+        snprintf(reason, sizeof reason, "has another length than its record");
+        whole = false;
     }
-    return false;
+    if (whole)
+        XXH3_64bits_reset(state);
+    for (uint64_t at = FRAME_PREAMBLE; whole && error == 0 && at < info->bytes; at += PIECE) {
+        size_t n = info->bytes - at < PIECE ? (size_t)(info->bytes - at) : PIECE;
+        error = journal_read_at(fd, piece, n, info->offset + at);
+        if (error == 0)
+            XXH3_64bits_update(state, piece, n);
+    }
+    if (whole && error == 0 && XXH3_64bits_digest(state) != view.digest) {
+        snprintf(reason, sizeof reason, "does not match its digest");
+        whole = false;
+    }
+    if (error != 0)
+        journal_failure(error, path, why);
+    else if (!whole)
+        journal_explain(why, "%.300s: damaged frame at byte %llu: %s", path,
+                        (unsigned long long)info->offset, reason);
+    free(text);
+    free(piece);
+    XXH3_freeState(state);
+    return error != 0 ? error : whole ? 0 : EBADMSG;
 }
 
-// Reads one segment that is mapped at `map` into the index. Returns the bytes that are whole, or
-// UINT64_MAX on damage.
-static uint64_t segment_scan(struct journal *j, const struct journal_segment *segment,
-                             const unsigned char *map, bool last, const char *path, char *why) {
+// Whether a whole record header stands anywhere in [from, bytes) of the file: then what lies before
+// is no torn tail. 0 or errno. Pieces overlap by a header, so that none falls between two.
+static int record_follows(int fd, uint64_t from, uint64_t bytes, bool *follows) {
+    unsigned char *piece = malloc(PIECE);
+    int error = piece == NULL ? ENOMEM : 0;
+    *follows = false;
+    while (error == 0 && !*follows && from + JOURNAL_HEADER <= bytes) {
+        size_t n = bytes - from < PIECE ? (size_t)(bytes - from) : PIECE;
+        error = journal_read_at(fd, piece, n, from);
+        for (size_t at = 0; error == 0 && !*follows && at + JOURNAL_HEADER <= n; at++) {
+            const unsigned char *hit = memmem(piece + at, n - at, RECORD_MAGIC, 4);
+            at = hit != NULL ? (size_t)(hit - piece) : n;
+            *follows = at + JOURNAL_HEADER <= n && journal_header_whole(hit, RECORD_MAGIC, 4);
+        }
+        from += n - JOURNAL_HEADER + 1;
+    }
+    free(piece);
+    return error;
+}
+
+static uint64_t scan_failed(int error, const char *path, char *why) {
+    journal_failure(error, path, why);
+    return UINT64_MAX;
+}
+
+// Reads one segment into the index. Returns the bytes that are whole, or UINT64_MAX on damage.
+// Not by a mapping: a sector that cannot be read would end the daemon there instead of this run.
+static uint64_t segment_scan(struct journal *j, const struct journal_segment *segment, int fd,
+                             bool last, const char *path, char *why) {
     uint64_t at = JOURNAL_HEADER;
     while (at < segment->bytes) {
-        const unsigned char *record = map + at;
+        unsigned char record[JOURNAL_HEADER + FRAME_PREAMBLE];
         uint64_t left = segment->bytes - at;
-        bool torn = left < JOURNAL_HEADER + FRAME_PREAMBLE ||
-                    !journal_header_whole(record, RECORD_MAGIC, 4);
+        bool torn = left < sizeof record, follows = false;
+        int error = torn ? 0 : journal_read_at(fd, record, sizeof record, at);
+        if (error != 0)
+            return scan_failed(error, path, why);
+        torn = torn || !journal_header_whole(record, RECORD_MAGIC, 4);
         struct journal_frame info = {0};
         if (!torn) {
             info = record_frame(record, segment, at);
             torn = info.bytes > left - JOURNAL_HEADER || info.bytes < FRAME_PREAMBLE;
         }
         if (torn) {
-            if (last && !record_follows(map, at + 1, segment->bytes))
+            error = last ? record_follows(fd, at + 1, segment->bytes, &follows) : 0;
+            if (error != 0)
+                return scan_failed(error, path, why);
+            if (last && !follows)
                 return at;
             journal_explain(why, "%.400s: damaged record at byte %llu", path,
                             (unsigned long long)at);
@@ -106,22 +170,15 @@ static uint64_t segment_scan(struct journal *j, const struct journal_segment *se
                             path, (unsigned long long)at);
             return UINT64_MAX;
         }
-        struct frame_view view;
-        char reason[128];
-        if (last &&
-            frame_open(record + JOURNAL_HEADER, info.bytes, &view, reason, sizeof reason) != 0) {
-            if (at + JOURNAL_HEADER + info.bytes == segment->bytes)
-                return at;
-            journal_explain(why, "%.300s: damaged frame at byte %llu: %s", path,
-                            (unsigned long long)at, reason);
-            return UINT64_MAX;
-        }
+        error = last ? frame_check(fd, &info, path, why) : 0;
+        if (error == EBADMSG && at + JOURNAL_HEADER + info.bytes == segment->bytes)
+            return at;
+        if (error != 0)
+            return UINT64_MAX; // explained
         memcpy(&info.digest, record + JOURNAL_HEADER + 24, 8);
         if (!journal_grow((void **)&j->frames, &j->frames_capacity, j->n_frames + 1,
-                          sizeof *j->frames)) {
-            journal_failure(ENOMEM, path, why);
-            return UINT64_MAX;
-        }
+                          sizeof *j->frames))
+            return scan_failed(ENOMEM, path, why);
         j->frames[j->n_frames++] = info;
         j->chain = chain;
         at += JOURNAL_HEADER + info.bytes;
@@ -141,31 +198,35 @@ static bool segment_open(struct journal *j, uint32_t number, bool last, char *wh
         return false;
     }
     struct journal_segment segment = {.number = number, .bytes = (uint64_t)info.st_size};
-    const unsigned char *map = NULL;
+    unsigned char header[JOURNAL_HEADER];
+    bool follows = false, begun = segment.bytes >= JOURNAL_HEADER;
     uint64_t whole = UINT64_MAX;
-    if (segment.bytes >= JOURNAL_HEADER)
-        map = mmap(NULL, segment.bytes, PROT_READ, MAP_PRIVATE, fd, 0);
-    if (segment.bytes >= JOURNAL_HEADER && map == MAP_FAILED) {
-        journal_failure(errno, path, why);
+    int error = begun ? journal_read_at(fd, header, sizeof header, 0) : 0;
+    if (error != 0) {
+        journal_failure(error, path, why);
         close(fd);
         return false;
     }
-    if (map == NULL) {
+    if (!begun) {
         whole = 0;
         if (!last) {
             journal_explain(why, "%.400s: cut short at byte %llu", path,
                             (unsigned long long)segment.bytes);
             whole = UINT64_MAX;
         }
-    } else if (!journal_header_whole(map, SEGMENT_MAGIC, 8) || journal_take32(map + 12) != number) {
-        if (last && !record_follows(map, 0, segment.bytes))
+    } else if (!journal_header_whole(header, SEGMENT_MAGIC, 8) ||
+               journal_take32(header + 12) != number) {
+        error = last ? record_follows(fd, 0, segment.bytes, &follows) : 0;
+        if (error != 0)
+            journal_failure(error, path, why);
+        else if (last && !follows)
             whole = 0; // its header never reached the disk, nor did anything after it
         else
             journal_explain(why, "%.400s: damaged header at byte 0", path);
     } else {
-        segment.first_seq = journal_take64(map + 16);
+        segment.first_seq = journal_take64(header + 16);
         if (j->n_segments == 0) { // earlier ones were dropped
-            j->chain = journal_take64(map + 24);
+            j->chain = journal_take64(header + 24);
             while (j->n_frames < segment.first_seq &&
                    journal_grow((void **)&j->frames, &j->frames_capacity, j->n_frames + 1,
                                 sizeof *j->frames)) {
@@ -174,13 +235,11 @@ static bool segment_open(struct journal *j, uint32_t number, bool last, char *wh
             }
             j->n_gone = j->n_frames;
         }
-        if (journal_take64(map + 24) != j->chain || segment.first_seq != j->n_frames)
+        if (journal_take64(header + 24) != j->chain || segment.first_seq != j->n_frames)
             journal_explain(why, "%.400s: does not follow the segment before it", path);
         else
-            whole = segment_scan(j, &segment, map, last, path, why);
+            whole = segment_scan(j, &segment, fd, last, path, why);
     }
-    if (map != NULL)
-        munmap((void *)(uintptr_t)map, segment.bytes);
     if (whole != UINT64_MAX && whole < segment.bytes) {
         j->cut_bytes += segment.bytes - whole;
         if (ftruncate(fd, (off_t)whole) != 0) {
@@ -476,26 +535,6 @@ bool journal_frame_at_step(struct journal *j, uint64_t step, struct journal_fram
     return found;
 }
 
-// Whether the frame at out->offset is what its digest says.
-static bool frame_whole(int fd, const struct journal_frame *info, const char *path, char *why) {
-    long page = sysconf(_SC_PAGESIZE);
-    uint64_t from = info->offset / (uint64_t)page * (uint64_t)page;
-    size_t lead = (size_t)(info->offset - from);
-    void *map = mmap(NULL, lead + info->bytes, PROT_READ, MAP_PRIVATE, fd, (off_t)from);
-    if (map == MAP_FAILED) {
-        journal_failure(errno, path, why);
-        return false;
-    }
-    struct frame_view view;
-    char reason[128];
-    bool whole = frame_open((char *)map + lead, info->bytes, &view, reason, sizeof reason) == 0;
-    if (!whole)
-        journal_explain(why, "%.300s: damaged frame at byte %llu: %s", path,
-                        (unsigned long long)info->offset, reason);
-    munmap(map, lead + info->bytes);
-    return whole;
-}
-
 int journal_frame_open(struct journal *j, uint64_t seq, struct journal_frame *out, char *why) {
     char path[PATH_MAX];
     if (!journal_frame(j, seq, out) || out->gone) {
@@ -515,11 +554,28 @@ int journal_frame_open(struct journal *j, uint64_t seq, struct journal_frame *ou
         close(fd);
         return -1;
     }
-    if (!frame_whole(fd, out, path, why)) {
+    if (frame_check(fd, out, path, why) != 0) {
         close(fd);
         return -1;
     }
     return fd;
+}
+
+unsigned char *journal_frame_read(struct journal *j, uint64_t seq, struct journal_frame *out,
+                                  char *why) {
+    int fd = journal_frame_open(j, seq, out, why);
+    unsigned char *bytes = fd >= 0 ? malloc(out->bytes) : NULL;
+    int error = fd >= 0 && bytes == NULL ? ENOMEM : 0;
+    if (bytes != NULL)
+        error = journal_read_at(fd, bytes, out->bytes, out->offset);
+    if (error != 0) {
+        journal_failure(error, j->folder, why);
+        free(bytes);
+        bytes = NULL;
+    }
+    if (fd >= 0)
+        close(fd);
+    return bytes;
 }
 
 bool journal_frame_map(struct journal *j, uint64_t seq, struct journal_map *out, char *why) {

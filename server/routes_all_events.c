@@ -42,7 +42,10 @@ static void watch_close(void *context) {
     free(w);
 }
 
-static struct told *told_of(struct watch *w, const char *id) {
+// `place`: where it most likely is, since both lists keep their order.
+static struct told *told_of(struct watch *w, const char *id, size_t place) {
+    if (place < w->n_told && strcmp(w->told[place].id, id) == 0)
+        return &w->told[place];
     for (size_t k = 0; k < w->n_told; k++)
         if (strcmp(w->told[k].id, id) == 0)
             return &w->told[k];
@@ -61,13 +64,16 @@ static struct told *told_of(struct watch *w, const char *id) {
 }
 
 // Tells of a run what is new: a change at once, how far it is every PROGRESS_SECONDS.
-static void tell_run(struct watch *w, struct run *run, FILE *out) {
-    struct run_status status = run_status(run);
-    struct journal *journal = run_journal(run);
-    struct told *told = told_of(w, run_id(run));
-    double t = run_clock();
+static void tell_run(struct watch *w, struct run *run, size_t place, FILE *out) {
+    struct told *told = told_of(w, run_id(run), place);
     if (told == NULL)
         return;
+    told->there = true;
+    if (strcmp(run_created(run), told->created) == 0 && run_state_is_final(told->state))
+        return; // there is nothing more to tell, however many of them are listed
+    struct run_status status = run_status(run);
+    struct journal *journal = run_journal(run);
+    double t = run_clock();
     struct told now = {.state = status.state,
                        .step = status.step,
                        .revision = status.revision,
@@ -82,7 +88,6 @@ static void tell_run(struct watch *w, struct run *run, FILE *out) {
                    now.revision != told->revision || now.epoch != told->epoch ||
                    now.n_warnings != told->n_warnings;
     bool further = now.step != told->step || now.frames != told->frames;
-    told->there = true;
     if (!changed && (!further || t - told->at < PROGRESS_SECONDS))
         return;
     cJSON *json = routes_run_json(run);
@@ -107,18 +112,18 @@ static bool watch_round(struct watch *w) {
         w->told[k].there = false;
     struct run **all = runs_all(w->routes->runs, &count);
     for (size_t k = 0; k < count; k++) {
-        tell_run(w, all[k], out);
+        tell_run(w, all[k], k, out);
         run_release(all[k]);
     }
     free(all);
-    for (size_t k = 0; k < w->n_told && !ending;) {
-        if (w->told[k].there) {
-            k++;
-            continue;
-        }
-        fprintf(out, "event: gone\ndata: {\"event\":\"gone\",\"id\":\"%s\"}\n\n", w->told[k].id);
-        w->told[k] = w->told[--w->n_told];
-    }
+    size_t kept = 0;
+    for (size_t k = 0; k < w->n_told && !ending; k++)
+        if (w->told[k].there)
+            w->told[kept++] = w->told[k];
+        else
+            fprintf(out, "event: gone\ndata: {\"event\":\"gone\",\"id\":\"%s\"}\n\n",
+                    w->told[k].id);
+    w->n_told = ending ? w->n_told : kept;
     if (!w->ready)
         fputs("event: ready\ndata: {\"event\":\"ready\"}\n\n", out);
     w->ready = true;

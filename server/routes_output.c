@@ -222,12 +222,12 @@ static void reply_frame(struct call *c, struct run *run, const struct thin *thin
                       c->names[0], text, (unsigned long long)n);
         return;
     }
-    struct journal_map map;
-    if (thin_asked(thin) && journal_frame_map(journal, seq, &map, why)) {
+    unsigned char *whole = thin_asked(thin) ? journal_frame_read(journal, seq, &frame, why) : NULL;
+    if (whole != NULL) {
         size_t bytes = 0;
-        c->reply->body = (char *)thin_frame(thin, map.frame, map.bytes, &bytes);
+        c->reply->body = (char *)thin_frame(thin, whole, frame.bytes, &bytes);
         c->reply->bytes = bytes;
-        journal_frame_unmap(&map);
+        free(whole);
         if (c->reply->body == NULL) {
             reply_problem(c->reply, 503, NULL, "no memory for the frame");
             return;

@@ -4,6 +4,7 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <unistd.h>
 
 #include "server/log.h"
 #include "server/routes_inside.h"
@@ -218,18 +219,17 @@ struct frame_stream {
     uint64_t next; // frame
     uint64_t news;
     struct thin thin;
-    struct journal_map map;
-    bool mapped;
-    unsigned char *thinned;
-    const unsigned char *at; // what is left of the frame being sent
+    int fd;                 // of the frame being sent, where it is sent as it stands; else -1
+    unsigned char *thinned; // or else what is sent
+    uint64_t at;            // what is left of it: place in the file or in `thinned`
     size_t left;
 };
 
 static void frame_done(struct frame_stream *s) {
-    if (s->mapped)
-        journal_frame_unmap(&s->map);
+    if (s->fd >= 0)
+        close(s->fd);
     free(s->thinned);
-    s->mapped = false;
+    s->fd = -1;
     s->thinned = NULL;
     s->left = 0;
 }
@@ -251,8 +251,21 @@ static bool frames_next(struct frame_stream *s) {
     frame_done(s);
     if (n <= s->next)
         return false;
-    s->mapped = journal_frame_map(journal, n - 1, &s->map, why);
-    if (!s->mapped) {
+    struct journal_frame frame = {0};
+    if (thin_asked(&s->thin)) {
+        unsigned char *whole = journal_frame_read(journal, n - 1, &frame, why);
+        if (whole != NULL) {
+            snprintf(why, sizeof why, "no memory to thin it");
+            s->thinned = thin_frame(&s->thin, whole, frame.bytes, &s->left);
+        }
+        free(whole);
+        s->at = 0;
+    } else {
+        s->fd = journal_frame_open(journal, n - 1, &frame, why);
+        s->at = frame.offset;
+        s->left = s->fd >= 0 ? frame.bytes : 0;
+    }
+    if (s->left == 0) {
         log_warn("stream", "run=%s seq=%llu why=\"%s\"", run_id(s->run), (unsigned long long)n - 1,
                  why);
         s->next = n;
@@ -261,15 +274,7 @@ static bool frames_next(struct frame_stream *s) {
     atomic_fetch_add(&s->routes->stream_skipped, n - 1 - s->next);
     atomic_fetch_add(&s->routes->stream_sent, 1);
     s->next = n;
-    s->at = s->map.frame;
-    s->left = s->map.bytes;
-    if (thin_asked(&s->thin)) {
-        s->thinned = thin_frame(&s->thin, s->map.frame, s->map.bytes, &s->left);
-        s->at = s->thinned;
-        if (s->thinned == NULL)
-            s->left = 0;
-    }
-    return s->left > 0;
+    return true;
 }
 
 static size_t frames_produce(void *context, char *out, size_t bytes) {
@@ -284,7 +289,15 @@ static size_t frames_produce(void *context, char *out, size_t bytes) {
         }
     }
     size_t n = s->left < bytes ? s->left : bytes;
-    memcpy(out, s->at, n);
+    if (s->thinned != NULL) {
+        memcpy(out, s->thinned + s->at, n);
+    } else {
+        ssize_t got = pread(s->fd, out, n, (off_t)s->at);
+        if (got <= 0)
+            return HTTP_END; // in the midst of a frame: the reader must not take the next for its
+                             // rest
+        n = (size_t)got;
+    }
     s->at += n;
     s->left -= n;
     return n;
@@ -304,7 +317,7 @@ void routes_serve_stream(struct call *c) {
     }
     uint64_t n = run_journal(run) != NULL ? journal_n_frames(run_journal(run)) : 0;
     *s = (struct frame_stream){
-        .routes = c->routes, .run = run, .thin = thin, .next = n > 0 ? n - 1 : 0};
+        .routes = c->routes, .run = run, .thin = thin, .fd = -1, .next = n > 0 ? n - 1 : 0};
     run_viewers(run, 1);
     c->reply->status = 200;
     c->reply->type = "application/vnd.fbard.frame";

@@ -1,4 +1,5 @@
 """Watching a run: server-sent events, the stream of frames, /metrics."""
+import contextlib
 import http.client
 import json
 import re
@@ -10,7 +11,7 @@ import time
 
 import numpy as np
 import pytest
-from boxes import WATER_PARTICLES, endless, water
+from boxes import WATER_PARTICLES, big, endless, water
 from fbard import FINAL, PATIENCE, is_sanitized, strict_json, until
 from frames import Frame
 
@@ -321,4 +322,42 @@ def test_stepping_shows_while_it_goes_on(daemon, name):
     first = metrics(daemon)["fbard_steps_total", ""]
     until(lambda: metrics(daemon)["fbard_steps_total", ""] > first)
     assert daemon.run(name)["state"] not in FINAL
+    daemon.away(name)
+
+
+def segment(daemon, run):
+    return daemon.data / "runs" / run / "frames-00000000.seg"
+
+
+def test_frame_that_rots_on_the_disk_is_an_error_and_no_more(daemon, name):
+    """A byte of the header that is read for thinning; whole or thinned, at once or as a stream."""
+    daemon.create(water(), id=name)
+    daemon.wait(name, "completed")
+    text = segment(daemon, name).read_bytes()
+    segment(daemon, name).write_bytes(text.replace(b'"count"', b'"kount"'))
+    for query in ("", "?max_particles=10", "?fields=position"):
+        reply = daemon.ask("GET", f"/v1/runs/{name}/frames/3{query}", status=500)
+        assert "digest" in reply.json["detail"], reply
+        with Stream(daemon, f"/v1/runs/{name}/stream{query}") as stream:
+            assert stream.answer.read() == b""
+    segment(daemon, name).write_bytes(text)
+    daemon.frame(name, 3)
+    daemon.away(name)
+
+
+def test_file_that_is_cut_under_a_stream_ends_the_stream_and_no_more(daemon, name):
+    """A mapping of it would be the end of the daemon."""
+    daemon.create(big(particles_per_cell=900), id=name, start=False)
+    whole = until(lambda: daemon.frames(name))[0]["bytes"]
+    assert whole > 10e6, "more than the sockets hold"
+    with Stream(daemon, f"/v1/runs/{name}/stream") as stream:
+        got = len(stream.answer.read(1000))
+        with open(segment(daemon, name), "r+b") as f:
+            f.truncate(1000)
+        with contextlib.suppress(http.client.IncompleteRead, ConnectionError):
+            while part := stream.answer.read(1 << 20):
+                got += len(part)
+        assert got < whole
+    assert daemon.request("GET", f"/v1/runs/{name}/frames/0").status == 500
+    assert daemon.run(name)["state"] == "paused"
     daemon.away(name)
