@@ -77,7 +77,7 @@ $(B)/obj/server/mpm/kernels.o: ALL_CFLAGS += $(if $(LEVELS),-DMPM_HAS_LANES)
 LANES_FLAGS = $(if $(filter asan tsan debug coverage,$(VARIANT)),-O1,-O2) -fno-tree-vectorize -fno-tree-slp-vectorize
 $(call levels,$(LANES_SRC)): ALL_CFLAGS += $(LANES_FLAGS)
 
-.PHONY: all programs deps deps-long deps-report libmpm demo report report-page check check-all check-layers check-unit check-physics check-api \
+.PHONY: all programs deps deps-long deps-report libmpm demo report report-page report-docs check check-all check-layers check-unit check-physics check-api \
 	check-cli check-loss check-asan check-clang check-fuzz check-tsan unit-programs check-long bench bench-solver bench-peer \
 	bench-recording bench-status fuzz install uninstall format clean help
 .DELETE_ON_ERROR:
@@ -306,6 +306,9 @@ report: deps-report ## the paper's figures with our numbers: build/report/SIZE/r
 
 report-page: deps-report ## the same page of what was run so far; runs nothing
 	@$(PYTHON) bench/report $(SIZE) --page
+
+report-docs: deps-report # docs/report.md and its pictures, of what was run so far
+	@$(PYTHON) bench/report $(SIZE) --page --docs
 
 # What is generated for an installation: manual pages and completions from the tables of the programs, the solver's
 # header as one file, and what names PREFIX.

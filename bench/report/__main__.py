@@ -3,7 +3,8 @@
     make report                 SIZE=small: minutes
     make report SIZE=paper      the paper's sizes: hours; goes on where it was stopped or killed
     make report-page SIZE=paper the page of what is there; runs nothing
-    python3 bench/report SIZE [--page | --runs] [--only PREFIX]... [--jobs N] [--folder DIR]
+    make report-docs SIZE=paper that, and docs/report.md with its pictures
+    python3 bench/report SIZE [--page | --runs] [--docs] [--only PREFIX]... [--jobs N] [--folder DIR]
 """
 import argparse
 import pathlib
@@ -25,12 +26,13 @@ import runs  # noqa: E402
 PARTS = (cook, footing, dam_break, landslide)
 
 
-def draw(size, folder):
-    """Writes the page of what is there; gives its path."""
+def draw(size, folder, docs):
+    """Writes the page of what is there, and docs/report.md if `docs`; gives the path of the last."""
     everything = [c for part in PARTS for c in part.cases(size)]
     shelf = recordings.Shelf(everything, folder / "runs", size)
     parts = [(part.TITLE, part.sections(shelf)) for part in PARTS]
-    return page.write(parts, shelf, folder, size)
+    path = page.write(parts, shelf, folder, size)
+    return page.write_docs(parts, shelf, folder, size, runs.ROOT / "docs") if docs else path
 
 
 def main():
@@ -38,6 +40,7 @@ def main():
     parser.add_argument("size", nargs="?", default="small", choices=cases.SIZES)
     parser.add_argument("--page", action="store_true", help="run nothing, draw what is there")
     parser.add_argument("--runs", action="store_true", help="draw nothing")
+    parser.add_argument("--docs", action="store_true", help="write docs/report.md and its pictures too")
     parser.add_argument("--only", action="append", metavar="PREFIX", help="run the cases whose names begin so")
     parser.add_argument("--jobs", type=int, help="runs at a time (one a core)")
     parser.add_argument("--folder", help="where everything goes (build/report/SIZE)")
@@ -55,7 +58,7 @@ def main():
     except runs.Trouble as e:
         sys.exit(f"report: {e}")
     if not options.runs:
-        print(draw(options.size, folder))
+        print(draw(options.size, folder, options.docs))
     return 1 if troubles else 0
 
 

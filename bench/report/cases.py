@@ -15,7 +15,7 @@ class Case:
     name: str  # of the run and of its files; unique in the report
     scene: object  # name of a built-in scene, path of a scene file, or the scene itself
     overrides: dict = dataclasses.field(default_factory=dict)  # merge patch (RFC 7396)
-    rank: int = 0  # lower ranks run first
+    rank: float = 0  # lower ranks run first
     labels: dict = dataclasses.field(default_factory=dict)  # what a part knows it by: basis, scheme, cell, ...
 
 
@@ -33,12 +33,13 @@ def merged(target, patch):
 
 
 def grid(prefix, scene, overrides, ranks, bases=("gimp", "bspline2"), schemes=tuple(SCHEMES), **labels):
-    """Cases of one scene for each basis and scheme. ranks(basis, scheme): the rank, or None where there is no such
-    case."""
+    """Cases of one scene for each basis and scheme. ranks: a rank, or ranks(basis, scheme) that gives it, or None where
+    there is no such case."""
     made = []
     for basis, scheme in itertools.product(bases, schemes):
         rank = ranks(basis, scheme) if callable(ranks) else ranks
         if rank is not None:
+            rank += 0.5 * (scheme == "anchored")  # what the paper shows comes first
             own = merged(overrides, {"basis": basis, "fbar": SCHEMES[scheme]})
             made.append(Case(f"{prefix}-{basis}-{scheme}", scene, own, rank,
                              dict(labels, basis=basis, scheme=scheme)))  # fmt: skip

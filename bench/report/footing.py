@@ -41,7 +41,7 @@ def cases(size):
     scene, height = {"small": ("strip-footing-small", 1.5), "paper": ("strip-footing", 6.0)}[size]
     for n in levels(size):
         ranks = {
-            10: lambda b, s: 31, 20: lambda b, s: 30,
+            10: lambda b, s: 32, 20: lambda b, s: 30,
             40: lambda b, s: {"zhao": 40, "standard": 55, "anchored": 70}[s] + (b == "bspline2"),
             80: lambda b, s: 95 if (b, s) == ("gimp", "zhao") else None,
         }[n]  # fmt: skip
@@ -49,9 +49,9 @@ def cases(size):
     # On the smaller ground a finer grid is within reach.
     if size == "paper":
         for n in (10, 20, 40, 80):
-            made += grid(f"footing-near-B{n}", "strip-footing-small", at_cell(n, 1.5, frames=5), 85 if n == 80 else 32,
+            made += grid(f"footing-near-B{n}", "strip-footing-small", at_cell(n, 1.5, frames=5), {40: 42, 80: 85}.get(n, 33),
                          schemes=("zhao",), near=n)  # fmt: skip
-    made += grid("footing-slow-B20", "strip-footing-small", at_cell(20, 1.5, SLOW), 33,
+    made += grid("footing-slow-B20", "strip-footing-small", at_cell(20, 1.5, SLOW), 34,
                  schemes=("zhao", "anchored"), slow=20)  # fmt: skip
     return made
 
