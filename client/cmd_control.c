@@ -107,6 +107,8 @@ const struct command cmd_step = {
     .name = "step",
     .positionals = "RUN [N]",
     .summary = "run N steps (1) of a paused run, then pause again",
+    .examples = "fbar step dam 100\n"
+                "fbar step dam --until 0.4",
     .least = 1,
     .most = 2,
     .options = step_options,

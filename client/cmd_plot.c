@@ -1,4 +1,5 @@
-// fbar plot: pictures of the particles of recordings, coloured by a field.
+// fbar plot: pictures of recordings. Particles coloured by a field, or by the difference of two; the
+// curves of probes (curves.c).
 #include <cjson/cJSON.h>
 #include <errno.h>
 #include <math.h>
@@ -9,6 +10,7 @@
 
 #include "client/arguments.h"
 #include "client/client.h"
+#include "client/curves.h"
 #include "client/interrupt.h"
 #include "client/montage.h"
 #include "client/picture.h"
@@ -21,14 +23,16 @@
 #define DEFAULT_WIDTH 1600
 
 static const struct option_spec options[] = {
+    {"output", 'o', "FILE.png", "the picture"},
     {"field", 'f', "NAME", "what colours the particles (default mean_stress)"},
-    {"component", 'c', "NAME",
+    {"component", 'c', "COMPONENT",
      "x, y, z or xx, xy, ... or magnitude (default) of a vector or tensor"},
     {"time", 't', "TIME", "the nearest frame, s (default: the last); T1,T2,... are a row each"},
-    {"output", 'o', "FILE.png", "the picture"},
-    {"series", 0, "DIR", "a picture of every frame into DIR, with one range"},
+    {"difference", 'd', NULL, "the second recording less the first, or the second of two times"},
+    {"probe", 'p', "PROBE,...", "curves of these probes instead of particles, or of `all`"},
+    {"series", 0, "DIR", "a picture of every frame into DIR, with one range, for a film"},
     {"range", 'r', "LOW:HIGH", "of the colours, in the field's unit (default: 1 % to 99 %)"},
-    {"axes", 0, "X0:X1,Y0:Y1", "part that is shown, m (3D: and Z0:Z1; default: all particles)"},
+    {"axes", 0, "X0:X1,Y0:Y1", "part that is shown, m (3D: and Z0:Z1; curves: s and value)"},
     {"size", 0, "WxH", "pixels (default: 1600 wide, as high as the shape asks for)"},
     {NULL, 0, NULL, NULL},
 };
@@ -36,6 +40,7 @@ static const struct option_spec options[] = {
 struct plot {
     int n_columns, n_rows; // recordings and times
     struct plotted columns[MONTAGE_MOST_COLUMNS];
+    struct plotted minus; // of a difference; its path is NULL where there is none
     double times[MONTAGE_MOST_ROWS];
     size_t n_frames, frames[MONTAGE_MOST_COLUMNS][SAMPLE_FRAMES]; // what each column looks at
     double low[3], high[3];                                       // of all axes
@@ -115,7 +120,7 @@ static int parse(struct plot *p, const struct arguments *arguments) {
     const bool series = arguments_flag(arguments, "series");
     if (!arguments_flag(arguments, "output") == !series) {
         terminal_error(
-            "usage: fbar plot FILE.h5... --field NAME, and either -o FILE.png or --series DIR");
+            "usage: fbar plot FILE.h5... [--field NAME], and either -o FILE.png or --series DIR");
         return -1;
     }
     p->n_columns = arguments->n_positionals;
@@ -128,9 +133,16 @@ static int parse(struct plot *p, const struct arguments *arguments) {
         (range && parse_range(range, p->range) != 0))
         return -1;
     p->range_given = range != NULL;
-    if (series && (p->n_columns > 1 || p->n_rows > 1)) {
-        terminal_error("--series: draws every frame of one recording; several recordings or times "
-                       "are one picture, -o FILE.png");
+    if (series && time) {
+        terminal_error("--series: draws every frame, so --time has no place");
+        return -1;
+    }
+    if (arguments_flag(arguments, "difference") &&
+        !(p->n_columns == 2 && p->n_rows <= 1) && !(p->n_columns == 1 && p->n_rows == 2)) {
+        terminal_error("--difference: must have two recordings (and one time, or none), or one "
+                       "recording and --time T1,T2; got %d recording%s and %d time%s",
+                       p->n_columns, p->n_columns == 1 ? "" : "s", p->n_rows,
+                       p->n_rows == 1 ? "" : "s");
         return -1;
     }
     return 0;
@@ -211,42 +223,38 @@ static void copy_axes(struct plot *p) {
 
 // ---- Pictures ---------------------------------------------------------------------------------
 
+// What frame of what run a picture shows, and what was subtracted.
+static void put_when(const struct plotted *p, size_t frame, char *out, size_t n) {
+    const struct store_contents *c = p->contents;
+    const char *fbar = c->fbar[frame] ? "F-bar on" : "F-bar off";
+    if (!p->minus) {
+        snprintf(out, n, "t = %.4g s  ·  %s  ·  %s", c->time[frame], fbar, c->run);
+        return;
+    }
+    const size_t other = plotted_minus_frame(p, frame);
+    const struct store_contents *m = p->minus->contents;
+    if (strcmp(p->path, p->minus->path) == 0)
+        snprintf(out, n, "t = %.4g s less t = %.4g s  ·  %s  ·  %s", c->time[frame], m->time[other],
+                 fbar, c->run);
+    else
+        snprintf(out, n, "t = %.4g s  ·  %s (%s) less %s (%s)", c->time[frame], c->run, fbar, m->run,
+                 m->fbar[other] ? "F-bar on" : "F-bar off");
+}
+
 static int draw(struct plot *p, size_t frame, const char *path) {
     struct plotted *column = &p->columns[0];
     const struct store_contents *c = column->contents;
-    char subtitle[320];
+    char subtitle[1024], when[600];
     struct picture picture = {.path = path,
                               .title = *column->title ? column->title : c->run,
                               .subtitle = subtitle,
                               .width = p->width,
                               .height = p->height};
-    snprintf(subtitle, sizeof subtitle, "%s  ·  t = %.4g s  ·  F-bar %s  ·  %s", column->name,
-             c->time[frame], c->fbar[frame] ? "on" : "off", c->run);
+    put_when(column, frame, when, sizeof when);
+    snprintf(subtitle, sizeof subtitle, "%s  ·  %s", column->name, when);
     if (plotted_panel(column, frame, &picture.panel) != 0)
         return -1;
     return picture_draw(&picture, column->why, sizeof column->why);
-}
-
-static int draw_series(struct plot *p, const char *folder) {
-    struct plotted *column = &p->columns[0];
-    const size_t n = column->contents->n_frames;
-    char path[4096];
-    if (mkdir(folder, 0777) != 0 && errno != EEXIST) {
-        snprintf(column->why, sizeof column->why, "%s: %s", folder, strerror(errno));
-        return -1;
-    }
-    for (size_t i = 0; i < n; i++) {
-        snprintf(path, sizeof path, "%s/%s-%06zu.png", folder, column->array->name, i);
-        if (interrupt_count() || draw(p, i, path) != 0)
-            return -1;
-        if (terminal_interactive()) {
-            char line[96];
-            snprintf(line, sizeof line, "picture %zu of %zu", i + 1, n);
-            terminal_status(line);
-        }
-    }
-    terminal_status_end(false);
-    return 0;
 }
 
 // Whether F-bar is on in the frames that column k shows.
@@ -341,6 +349,35 @@ static int draw_grid(struct plot *p, const char *path, struct plotted **failed) 
     return montage_finish(drawing, column->why, sizeof column->why);
 }
 
+// A picture of every frame of the first recording; beside it the frames of the others that are
+// nearest in time.
+static int draw_series(struct plot *p, const char *folder, struct plotted **failed) {
+    struct plotted *first = *failed = &p->columns[0];
+    const size_t n = first->contents->n_frames;
+    char path[4096];
+    if (mkdir(folder, 0777) != 0 && errno != EEXIST) {
+        snprintf(first->why, sizeof first->why, "%s: %s", folder, strerror(errno));
+        return -1;
+    }
+    for (size_t i = 0; i < n; i++) {
+        snprintf(path, sizeof path, "%s/%s-%06zu.png", folder, first->array->name, i);
+        if (interrupt_count())
+            return -1;
+        for (int k = 0; k < p->n_columns; k++)
+            p->frames[k][0] =
+                k == 0 ? i : plotted_nearest_frame(&p->columns[k], first->contents->time[i]);
+        if (p->n_columns > 1 ? draw_grid(p, path, failed) != 0 : draw(p, i, path) != 0)
+            return -1;
+        if (terminal_interactive()) {
+            char line[96];
+            snprintf(line, sizeof line, "picture %zu of %zu", i + 1, n);
+            terminal_status(line);
+        }
+    }
+    terminal_status_end(false);
+    return 0;
+}
+
 // ---- Answers ----------------------------------------------------------------------------------
 
 static const char *unit_of(const struct plotted *p) {
@@ -358,6 +395,23 @@ static cJSON *describe(const struct plotted *p, size_t frame, const char *file) 
     cJSON_AddNumberToObject(answer, "high", p->panel.range[1] / p->scale);
     cJSON_AddStringToObject(answer, "unit", p->array->unit);
     return answer;
+}
+
+// A folder of pictures, and how they become a film.
+static void print_series(const struct plot *p, bool json, const char *folder) {
+    const struct plotted *q = &p->columns[0];
+    const size_t n = q->contents->n_frames;
+    if (!json) {
+        printf("%s: %zu pictures of %s, t = %.4g to %.4g s\n"
+               "a film of them: ffmpeg -framerate 25 -i %s/%s-%%06d.png -pix_fmt yuv420p film.mp4\n",
+               folder, n, q->name, q->contents->time[0], q->contents->time[n - 1], folder,
+               q->array->name);
+        return;
+    }
+    cJSON *answer = describe(q, n - 1, folder);
+    cJSON_AddNumberToObject(answer, "pictures", (double)n);
+    report_json(answer);
+    cJSON_Delete(answer);
 }
 
 static void print_result(const struct plot *p, bool json, const char *path, size_t frame) {
@@ -401,10 +455,32 @@ static void print_grid(const struct plot *p, bool json, const char *path) {
     cJSON_Delete(answer);
 }
 
+// Of two times: the second less the first, of one recording. Of two recordings: the second, which
+// was opened as the only column, less the first.
+static int subtract(struct plot *p) {
+    size_t frame = PLOTTED_NEAREST;
+    if (p->minus.contents->dimension != p->columns[0].contents->dimension) {
+        terminal_error("%s: is %dD, unlike %s", p->columns[0].path,
+                       p->columns[0].contents->dimension, p->minus.path);
+        return CLIENT_USAGE;
+    }
+    if (p->n_rows == 2) {
+        frame = plotted_nearest_frame(&p->minus, p->times[0]);
+        p->times[0] = p->times[1];
+        p->n_rows = 1;
+    }
+    return plotted_subtract(&p->columns[0], &p->minus, frame);
+}
+
 static int plot(struct plot *p, const struct client *client, const struct arguments *arguments) {
     const char *output = arguments_value(arguments, "output");
     const char *series = arguments_value(arguments, "series");
     const char *axes = arguments_value(arguments, "axes");
+    if (p->minus.path) { // one picture, of the second recording or time
+        const int code = subtract(p);
+        if (code != CLIENT_DONE)
+            return code;
+    }
     const bool grid = p->n_columns > 1 || p->n_rows > 1;
     struct plotted *failed = &p->columns[0];
     for (int k = 1; k < p->n_columns; k++)
@@ -427,7 +503,7 @@ static int plot(struct plot *p, const struct client *client, const struct argume
         return CLIENT_USAGE;
     copy_axes(p);
     const size_t frame = series ? failed->contents->n_frames - 1 : p->frames[0][0];
-    const int status = series ? draw_series(p, series)
+    const int status = series ? draw_series(p, series, &failed)
                        : grid ? draw_grid(p, output, &failed)
                               : draw(p, frame, output);
     if (status != 0 && interrupt_count())
@@ -436,32 +512,72 @@ static int plot(struct plot *p, const struct client *client, const struct argume
         terminal_error("%s", failed->why);
         return CLIENT_IO;
     }
-    if (grid)
+    if (series)
+        print_series(p, client->json, series);
+    else if (grid)
         print_grid(p, client->json, output);
     else
-        print_result(p, client->json, series ? series : output, frame);
+        print_result(p, client->json, output, frame);
     return CLIENT_DONE;
+}
+
+static int open_columns(struct plot *p, const struct arguments *arguments) {
+    const char *field = arguments_value(arguments, "field");
+    const char *component = arguments_value(arguments, "component");
+    const char *const *files = arguments->positionals;
+    int code = CLIENT_DONE;
+    if (!field)
+        field = "mean_stress";
+    if (arguments_flag(arguments, "difference")) {
+        code = plotted_open(&p->minus, files[0], field, component);
+        files += p->n_columns - 1;
+        p->n_columns = 1;
+    }
+    for (int k = 0; k < p->n_columns && code == CLIENT_DONE; k++)
+        code = plotted_open(&p->columns[k], files[k], field, component);
+    return code;
+}
+
+static int plot_curves(const struct client *client, const struct arguments *arguments,
+                       const struct plot *p) {
+    static const char *const others[] = {"field", "component", "time", "difference", "series",
+                                         "range"};
+    const char *axes = arguments_value(arguments, "axes");
+    for (size_t i = 0; i < sizeof others / sizeof *others; i++)
+        if (arguments_flag(arguments, others[i])) {
+            terminal_error("--%s: is for pictures of particles, not for --probe", others[i]);
+            return CLIENT_USAGE;
+        }
+    struct curves_options curves = {.n_files = p->n_columns,
+                                     .files = arguments->positionals,
+                                     .probes = arguments_value(arguments, "probe"),
+                                     .path = arguments_value(arguments, "output"),
+                                     .width = p->width,
+                                     .height = p->height,
+                                     .limited = axes != NULL};
+    if (axes && parse_axes(axes, 2, curves.low, curves.high) != 0)
+        return CLIENT_USAGE;
+    return curves_plot(client, &curves);
 }
 
 static int run(struct client *client, const struct arguments *arguments) {
     struct plot *p = calloc(1, sizeof *p);
-    const char *field = arguments_value(arguments, "field");
     int code = CLIENT_USAGE;
     if (!p) {
         terminal_error("out of memory");
         return CLIENT_IO;
     }
     p->width = DEFAULT_WIDTH;
-    if (parse(p, arguments) == 0) {
-        code = CLIENT_DONE;
-        for (int k = 0; k < p->n_columns && code == CLIENT_DONE; k++)
-            code = plotted_open(&p->columns[k], arguments->positionals[k],
-                                field ? field : "mean_stress",
-                                arguments_value(arguments, "component"));
+    const bool parsed = parse(p, arguments) == 0;
+    if (parsed && arguments_flag(arguments, "probe")) {
+        code = plot_curves(client, arguments, p);
+    } else if (parsed) {
+        code = open_columns(p, arguments);
         if (code == CLIENT_DONE)
             code = plot(p, client, arguments);
         for (int k = 0; k < p->n_columns && k < MONTAGE_MOST_COLUMNS; k++)
             plotted_close(&p->columns[k]);
+        plotted_close(&p->minus);
     }
     free(p);
     return code;
@@ -470,10 +586,16 @@ static int run(struct client *client, const struct arguments *arguments) {
 const struct command cmd_plot = {
     .name = "plot",
     .positionals = "FILE.h5... -o PNG",
-    .summary = "draw the particles of recordings, coloured by a field",
+    .summary = "draw particles coloured by a field, or curves of probes",
     .doc = "Several recordings or several times give one picture: a column for each recording, a\n"
            "row for each time, all with the same axes. Each column has its own range and colour\n"
-           "bar, unless --range gives one to all.",
+           "bar, unless --range gives one to all. A difference is taken particle by particle.\n"
+           "Curves have the references of the scene as points.",
+    .examples = "fbar plot dam.h5 --field velocity --time 0.4 -o dam.png\n"
+                "fbar plot off.h5 on.h5 --time 0.4,1,2 -o both.png\n"
+                "fbar plot off.h5 on.h5 --difference --time 0.4 -o difference.png\n"
+                "fbar plot off.h5 on.h5 --probe front,energy -o curves.png\n"
+                "fbar plot off.h5 on.h5 --series film",
     .least = 1,
     .most = -1,
     .options = options,

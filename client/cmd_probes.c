@@ -51,6 +51,8 @@ const struct command cmd_probes = {
     .name = "probes",
     .positionals = "RUN",
     .summary = "print the time series of the probes",
+    .examples = "fbar probes dam > dam.csv\n"
+                "fbar --json probes dam --since 1000",
     .least = 1,
     .most = 1,
     .options = options,

@@ -114,6 +114,7 @@ const struct command cmd_record = {
     .doc = "Ends when the run ends. Interrupted or killed, the same command goes on where it was; "
            "on a\n"
            "finished recording it does nothing.",
+    .examples = "fbar record dam -o dam.h5",
     .least = 1,
     .most = 1,
     .options = record_options,

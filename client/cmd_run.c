@@ -76,6 +76,8 @@ static int watch(struct client *client, const char *path, bool private, cJSON **
             return CLIENT_INTERRUPTED;
         if (interrupt_count() && !asked) {
             char *action = NULL;
+            terminal_note("asking the daemon to %s the run; Ctrl-C again leaves at once",
+                          private ? "cancel" : "pause");
             if (asprintf(&action, "%s:%s", path, private ? "cancel" : "pause") > 0)
                 request_json(client, "POST", action, NULL, NULL);
             free(action);
@@ -85,6 +87,21 @@ static int watch(struct client *client, const char *path, bool private, cJSON **
         usleep(100000);
         clock += 0.1;
     }
+}
+
+// After an interruption: the run is another's to command, or still this user's.
+static void say_how_to_go_on(const struct client *client, const cJSON *run, const char *id,
+                             const char *file) {
+    char to[1100] = "";
+    if (client->url_given)
+        snprintf(to, sizeof to, " --url %s", client->url);
+    if (strcmp(progress_state(run), "paused") == 0)
+        terminal_note("%s is paused; go on with `fbar%s resume %s`", id, to, id);
+    else
+        terminal_note("%s goes on in the daemon; look with `fbar%s watch %s`", id, to, id);
+    if (file)
+        terminal_note("%s holds what came so far; record the rest with `fbar%s record %s -o %s`", file,
+                      to, id, file);
 }
 
 static int follow(struct client *client, const struct arguments *arguments, const char *id,
@@ -124,9 +141,7 @@ static int follow(struct client *client, const struct arguments *arguments, cons
         if (code == CLIENT_DONE)
             code = outcome;
         else if (!private)
-            terminal_note("paused; `fbar resume %s` continues it%s%s%s", id,
-                          file ? ", and `fbar record " : "", file ? id : "",
-                          file ? " -o ...` the recording" : "");
+            say_how_to_go_on(client, run, id, file);
     }
     cJSON_Delete(run);
     free(path);
@@ -176,7 +191,11 @@ const struct command cmd_run = {
     .doc = "SCENE is the name of a built-in scene (`fbar scenes`) or a .json file. Without --url, "
            "and\n"
            "with no daemon at the default address, a private one is started for this run.\n"
-           "Ctrl-C pauses the run (a private daemon's is cancelled) and closes the file.",
+           "Ctrl-C pauses the run (a private daemon's is cancelled), closes the file and says how to\n"
+           "go on; a second one leaves at once. Values are JSON, or else text.",
+    .examples = "fbar run dam-break -o dam.h5\n"
+                "fbar run dam-break -o off.h5 --set fbar=false --set time.end=0.5\n"
+                "fbar run my-scene.json -o mine.h5 --set materials.water.density=1e3",
     .least = 1,
     .most = 1,
     .options = options,

@@ -50,6 +50,9 @@ const struct command cmd_scenes = {
     .name = "scenes",
     .positionals = "[NAME]",
     .summary = "list the built-in scenes, or print one",
+    .doc = "A scene that is printed may be changed and run: `fbar run FILE.json`.",
+    .examples = "fbar scenes\n"
+                "fbar scenes dam-break > my-scene.json",
     .least = 0,
     .most = 1,
     .run = run,

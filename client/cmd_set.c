@@ -41,6 +41,9 @@ const struct command cmd_set = {
     .doc =
         "Keys are fbar, damping.local, damping.mass, transfer.blend, time.dt, time.cfl, time.end,\n"
         "output.interval, gravity and the like; values are JSON.",
+    .examples = "fbar set dam fbar=false\n"
+                "fbar set dam 'fbar={\"scheme\": \"anchored\"}'\n"
+                "fbar set dam time.end=3 output.interval=0.01",
     .least = 2,
     .most = -1,
     .run = run,

@@ -114,10 +114,89 @@ size_t plotted_nearest_frame(const struct plotted *p, double time) {
     return best;
 }
 
+size_t plotted_minus_frame(const struct plotted *p, size_t frame) {
+    return p->minus_frame == PLOTTED_NEAREST
+               ? plotted_nearest_frame(p->minus, p->contents->time[frame])
+               : p->minus_frame;
+}
+
+static bool has_ids(const struct plotted *p) {
+    for (size_t i = 0; i < p->contents->n_arrays; i++)
+        if (strcmp(p->contents->arrays[i].name, "id") == 0)
+            return true;
+    return false;
+}
+
+// The particles' ids into p->value, or their places where the recording has no ids: particles keep
+// their order over a run.
+static int load_ids(struct plotted *p, size_t frame) {
+    const size_t n = p->contents->count[frame];
+    if (has_ids(p))
+        return store_read_array(p->h5, "id", frame, p->value, p->why, sizeof p->why);
+    for (size_t i = 0; i < n; i++)
+        p->value[i] = (double)i;
+    return 0;
+}
+
+// Takes the same particles of `minus` from p->raw; what it does not have becomes NaN.
+static int subtract(struct plotted *p, size_t frame) {
+    struct plotted *q = p->minus;
+    const size_t other = plotted_minus_frame(p, frame), k = p->array->components;
+    const size_t n = p->contents->count[frame], m = q->contents->count[other];
+    if (load_ids(q, other) != 0 ||
+        store_read_array(q->h5, q->array->name, other, q->raw, q->why, sizeof q->why) != 0) {
+        snprintf(p->why, sizeof p->why, "%s", q->why);
+        return -1;
+    }
+    memset(p->minus_row, 0xff, p->minus_ids * sizeof *p->minus_row);
+    for (size_t j = 0; j < m; j++)
+        if (q->value[j] >= 0 && q->value[j] < (double)p->minus_ids)
+            p->minus_row[(size_t)q->value[j]] = (uint32_t)j;
+    if (load_ids(p, frame) != 0)
+        return -1;
+    for (size_t i = 0; i < n; i++) {
+        const double id = p->value[i];
+        const uint32_t row = id >= 0 && id < (double)p->minus_ids ? p->minus_row[(size_t)id]
+                                                                  : UINT32_MAX;
+        for (size_t c = 0; c < k; c++)
+            p->raw[i * k + c] = row == UINT32_MAX ? NAN : p->raw[i * k + c] - q->raw[row * k + c];
+    }
+    return 0;
+}
+
+int plotted_subtract(struct plotted *p, struct plotted *minus, size_t frame) {
+    size_t most = 0, most_minus = 0;
+    for (size_t i = 0; i < p->contents->n_frames; i++)
+        most = p->contents->count[i] > most ? p->contents->count[i] : most;
+    for (size_t i = 0; i < minus->contents->n_frames; i++)
+        most_minus = minus->contents->count[i] > most_minus ? minus->contents->count[i] : most_minus;
+    if (most != most_minus) {
+        terminal_error("--difference: %s has %zu particles and %s %zu; it is taken particle by "
+                       "particle, of scenes with the same bodies and cells",
+                       minus->path, most_minus, p->path, most);
+        return CLIENT_USAGE;
+    }
+    p->minus_ids = most;
+    p->minus_row = malloc((most + 1) * sizeof *p->minus_row);
+    if (!p->minus_row) {
+        terminal_error("out of memory");
+        return CLIENT_IO;
+    }
+    p->minus = minus;
+    p->minus_frame = frame;
+    // A magnitude is that of the difference.
+    const bool magnitude = p->array->components > 1 && p->component == p->array->components;
+    char name[sizeof p->name];
+    snprintf(name, sizeof name, "%s", magnitude ? minus->array->name : minus->name);
+    snprintf(p->name, sizeof p->name, "difference of %.36s%s", name, magnitude ? ", magnitude" : "");
+    return CLIENT_DONE;
+}
+
 int plotted_load(struct plotted *p, size_t frame) {
     const size_t n = p->contents->count[frame], k = p->array->components;
     if (store_read_array(p->h5, "position", frame, p->position, p->why, sizeof p->why) != 0 ||
-        store_read_array(p->h5, p->array->name, frame, p->raw, p->why, sizeof p->why) != 0)
+        store_read_array(p->h5, p->array->name, frame, p->raw, p->why, sizeof p->why) != 0 ||
+        (p->minus && subtract(p, frame) != 0))
         return -1;
     for (size_t i = 0; i < n; i++) {
         double sum = 0;
@@ -212,6 +291,7 @@ void plotted_close(struct plotted *p) {
     free(p->position);
     free(p->raw);
     free(p->value);
+    free(p->minus_row);
     if (p->h5)
         store_close(p->h5);
     *p = (struct plotted){0};
@@ -287,7 +367,8 @@ void plotted_apply_range(struct plotted *p, const double fitted[2], bool given) 
         const char *prefix;
     } prefixes[] = {{1e9, "G"}, {1e6, "M"}, {1e3, "k"}};
     const double most = fmax(fabs(range[0]), fabs(range[1]));
-    p->panel.diverging = range[0] < 0 && range[1] > 0 && fmin(-range[0], range[1]) > 0.25 * most;
+    p->panel.diverging =
+        range[0] < 0 && range[1] > 0 && (p->minus || fmin(-range[0], range[1]) > 0.25 * most);
     if (p->panel.diverging && !given) { // the neutral colour is zero
         range[0] = -most;
         range[1] = most;

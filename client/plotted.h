@@ -2,6 +2,7 @@
 #pragma once
 #include <stdbool.h>
 #include <stddef.h>
+#include <stdint.h>
 
 #include "client/panel.h"
 #include "client/store.h"
@@ -19,12 +20,25 @@ struct plotted {
     char unit[40], label[128], why[512];
     double *position, *raw, *value; // of one frame, sized for the largest
     struct panel panel;             // what all frames share; low and high are the caller's
+    // What is subtracted, particle by particle (borrowed, or NULL), and its frame; PLOTTED_NEAREST:
+    // the one nearest in time to the frame that is shown.
+    struct plotted *minus;
+    size_t minus_frame;
+    uint32_t *minus_row; // of each id, in the frame of `minus`; sized for it
+    size_t minus_ids;
 };
+#define PLOTTED_NEAREST SIZE_MAX
 
 // Opens a recording and chooses a field and a component (NULL: the magnitude, or the scalar).
 // An exit code, with the fault printed; plotted_close in any case.
 int plotted_open(struct plotted *p, const char *path, const char *field, const char *component);
 void plotted_close(struct plotted *p);
+
+// From now on `p` shows its quantity less that of `minus`, which was opened with the same field and
+// component and must outlive it. An exit code, with the fault printed.
+int plotted_subtract(struct plotted *p, struct plotted *minus, size_t frame);
+// The frame of `minus` that belongs to a frame of `p`.
+size_t plotted_minus_frame(const struct plotted *p, size_t frame);
 
 size_t plotted_nearest_frame(const struct plotted *p, double time);
 // Reads a frame's particles: (count, 3) into position, the last axis up, and (count) into value, in

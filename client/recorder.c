@@ -211,6 +211,7 @@ static enum recorder_outcome pass_on_interrupt(struct recorder *r, double *deadl
     if (!action || interrupt_count() > 1)
         return RECORDER_OVER;
     snprintf(after, sizeof after, ":%s", action);
+    terminal_note("asking the daemon to %s the run; Ctrl-C again leaves at once", action);
     char *path = request_path("/v1/runs/", r->options->run, after);
     const struct request_spec spec = {
         .method = "POST", .path = path ? path : "/", .timeout_ms = 10000};
@@ -460,7 +461,7 @@ static int record(struct recorder *r) {
         return CLIENT_IO;
     if (build(r) == RECORDER_DISK)
         return CLIENT_IO;
-    if (!r->complete)
+    if (!r->complete && !r->options->on_interrupt)
         terminal_note("%s holds the first %zu frames; repeat the command to go on",
                       r->options->file, r->result->n_frames);
     return interrupted || (interrupt_count() && r->options->on_interrupt) ? CLIENT_INTERRUPTED

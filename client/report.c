@@ -129,7 +129,7 @@ static void print_references(const cJSON *accuracy) {
         printf(", reference %.6g", reference);
         // Of a reference of 0 the value itself is the error.
         if (cJSON_IsNumber(member(entry, "relative_error")) && reference != 0)
-            printf(" (%+.2f %%)", 100 * number(entry, "relative_error"));
+            printf(" (off by %.2f %%)", 100 * fabs(number(entry, "relative_error")));
         printf("  [%s]\n", text(entry, "source"));
     }
 }

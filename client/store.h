@@ -10,6 +10,7 @@
 
 #define STORE_FORMAT "fbard-recording-1"
 #define STORE_MAX_FIELDS 32
+#define STORE_MAX_PROBES 128 // that reading looks at
 
 // ---- Writing ----------------------------------------------------------------------------------
 
@@ -88,6 +89,15 @@ struct store_contents {
     const double *time;
     const uint8_t *fbar;
     const char *scene; // JSON text, "" when there is none
+    char probes[STORE_MAX_PROBES][96];
+    const double *change_time; // (n_changes) s
+};
+
+// The series of a probe, owned by the caller: n samples of n_components values, row by row.
+struct store_series {
+    size_t n, n_components;
+    double *time, *value; // s, `unit`
+    char unit[48], long_name[192], components[256];
 };
 
 // NULL with `why`; *foreign says that the file is there and is none of ours.
@@ -97,4 +107,7 @@ const struct store_contents *store_contents(const struct store_file *file);
 // it.
 int store_read_array(struct store_file *file, const char *name, size_t frame, double *out,
                      char *why, size_t why_bytes);
+int store_read_series(struct store_file *file, const char *probe, struct store_series *out,
+                      char *why, size_t why_bytes);
+void store_series_free(struct store_series *series);
 void store_close(struct store_file *file);

@@ -107,6 +107,16 @@ static herr_t on_array(hid_t group, const char *name, const H5L_info_t *info, vo
     return 0;
 }
 
+static herr_t on_probe(hid_t group, const char *name, const H5L_info_t *info, void *context) {
+    (void)group, (void)info;
+    struct store_contents *c = context;
+    if (c->n_probes == STORE_MAX_PROBES)
+        return 1;
+    snprintf(c->probes[c->n_probes], sizeof c->probes[0], "%s", name);
+    c->n_probes++;
+    return 0;
+}
+
 static int get_contents(struct store_file *f) {
     struct store_contents *c = &f->contents;
     const hid_t fbard = H5Gopen2(f->file, "/fbard", H5P_DEFAULT);
@@ -137,9 +147,15 @@ static int get_contents(struct store_file *f) {
     c->scene = get_scene(f);
     if (get_column(f, "/fbard/changes/step", H5T_NATIVE_UINT64, &changes))
         c->n_changes = changes;
-    H5G_info_t info;
-    if (H5Gget_info_by_name(f->file, "/fbard/probes", &info, H5P_DEFAULT) >= 0)
-        c->n_probes = info.nlinks;
+    c->change_time = get_column(f, "/fbard/changes/time", H5T_NATIVE_DOUBLE, &changes);
+    if (!c->change_time)
+        c->n_changes = 0;
+    const hid_t probes = H5Gopen2(f->file, "/fbard/probes", H5P_DEFAULT);
+    hsize_t first = 0;
+    if (probes >= 0) {
+        H5Literate(probes, H5_INDEX_NAME, H5_ITER_INC, &first, on_probe, c);
+        H5Gclose(probes);
+    }
     const hid_t data = H5Gopen2(f->file, "/VTKHDF/PointData", H5P_DEFAULT);
     if (data < 0)
         return -1;
@@ -202,6 +218,60 @@ int store_read_array(struct store_file *f, const char *name, size_t frame, doubl
     H5Sclose(space);
     H5Dclose(dataset);
     return status == 0 ? 0 : store_fail(f->path, why, why_bytes);
+}
+
+// The whole of a dataset as doubles: (rows[, columns]).
+static double *read_table(hid_t group, const char *name, size_t *rows, size_t *columns) {
+    const hid_t dataset = H5Dopen2(group, name, H5P_DEFAULT);
+    if (dataset < 0)
+        return NULL;
+    const hid_t space = H5Dget_space(dataset);
+    hsize_t extent[2] = {0, 1};
+    double *values = NULL;
+    if (H5Sget_simple_extent_ndims(space) <= 2 &&
+        H5Sget_simple_extent_dims(space, extent, NULL) >= 0)
+        values = calloc((size_t)(extent[0] * extent[1]) + 1, sizeof *values);
+    if (values &&
+        H5Dread(dataset, H5T_NATIVE_DOUBLE, H5S_ALL, H5S_ALL, H5P_DEFAULT, values) < 0) {
+        free(values);
+        values = NULL;
+    }
+    *rows = (size_t)extent[0];
+    *columns = (size_t)extent[1];
+    H5Sclose(space);
+    H5Dclose(dataset);
+    return values;
+}
+
+int store_read_series(struct store_file *f, const char *probe, struct store_series *out, char *why,
+                      size_t why_bytes) {
+    char place[128];
+    size_t rows = 0, columns = 0;
+    *out = (struct store_series){0};
+    snprintf(place, sizeof place, "/fbard/probes/%s", probe);
+    const hid_t group = H5Gopen2(f->file, place, H5P_DEFAULT);
+    if (group < 0)
+        return store_fail(f->path, why, why_bytes);
+    get_text(group, "components", out->components, sizeof out->components);
+    out->time = read_table(group, "time", &rows, &columns);
+    out->value = read_table(group, "value", &out->n, &out->n_components);
+    const hid_t dataset = H5Dopen2(group, "value", H5P_DEFAULT);
+    if (dataset >= 0) {
+        get_text(dataset, "unit", out->unit, sizeof out->unit);
+        get_text(dataset, "long_name", out->long_name, sizeof out->long_name);
+        H5Dclose(dataset);
+    }
+    H5Gclose(group);
+    if (out->time && out->value && rows == out->n)
+        return 0;
+    store_series_free(out);
+    return store_fail(f->path, why, why_bytes);
+}
+
+void store_series_free(struct store_series *series) {
+    free(series->time);
+    free(series->value);
+    *series = (struct store_series){0};
 }
 
 void store_close(struct store_file *f) {

@@ -224,6 +224,8 @@ class Fake:
             return ok(self.scene)
         if path == "/v1/scenes:validate":
             return ok({"valid": True, "estimate": {"particles": 50, "steps": 2000}})
+        if path == "/v1/runs" and method == "POST" and self.state == "paused":
+            self.state = "running"
         if path == "/v1/runs":
             return ok({"runs": [self.run_object()]}) if method == "GET" else ok(self.run_object(), 201)
         if path.startswith(base + "/recorders/"):
@@ -254,7 +256,9 @@ class Fake:
                 frame = frame[:100] + bytes([frame[100] ^ 1]) + frame[101:]
             return 200, "application/vnd.fbard.frame", frame
         if path == base + "/config" or path.startswith(base + ":"):
-            if path.endswith(":cancel"):
-                self.state = "cancelled"
+            action = path.rpartition(":")[2]
+            if action == "cancel" or self.state not in ("completed", "failed", "cancelled"):
+                self.state = {"cancel": "cancelled", "pause": "paused", "resume": "running",
+                              "start": "running"}.get(action, self.state)
             return ok({**self.run_object(), "effective_step": 700})
         return missing

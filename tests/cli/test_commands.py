@@ -205,9 +205,17 @@ def test_watch_exits_with_the_outcome(fbar, fake, start_fbar):
 
 def test_watch_on_a_terminal_redraws_one_line(fake):
     daemon = fake(n_frames=6)
-    daemon.play(0.15)
+    route, asked = daemon.route, []
+
+    def advance_when_asked(method, path, body, headers):
+        answer = route(method, path, body, headers)
+        if path == "/v1/runs/r1" and len(asked) < 6:
+            asked.append(path)
+            daemon.advance(live=False)
+        return answer
+    daemon.route = advance_when_asked
     result = subprocess.run(["script", "-qec", f"{conftest.FBAR} --url {daemon.url} watch r1",
-                             "/dev/null"], capture_output=True, timeout=10,
+                             "/dev/null"], capture_output=True, timeout=60,
                             env={**os.environ, "TERM": "xterm", "LC_ALL": "C.UTF-8"})
     assert result.stdout.count(b"\r\033[K") >= 2 and "█" in result.stdout.decode()
 
@@ -245,7 +253,8 @@ def test_run_interrupted_pauses_the_run_of_a_shared_daemon(fake, start_fbar, tmp
         _, err = runner.communicate(timeout=10)
         assert runner.returncode == 130, err
         assert ("POST", "/v1/runs/r1:pause") in daemon.requests
-        assert "fbar resume r1" in err
+        assert f"`fbar --url {daemon.url} resume r1`" in err and "Ctrl-C again leaves at once" in err
+        assert not words or f"`fbar --url {daemon.url} record r1 -o a.h5`" in err
         daemon.requests.clear()
 
 
@@ -367,7 +376,7 @@ def test_plot_of_several_says_what_is_wrong(fbar, recording, tmp_path):
                         (["a.h5"] * 8, "8 recordings"), (["a.h5", "--axes", "0:1"], "--axes")):
         result = fbar("plot", "a.h5", "-o", "g.png", *words)
         assert result.returncode == 2 and part in result.stderr, result.stderr
-    for words in (["a.h5"], ["-t", "0,1"]):
+    for words in (["-t", "1"], ["-t", "0,1"]):
         result = fbar("plot", "a.h5", *words, "--series", "film")
         assert result.returncode == 2 and "--series" in result.stderr
     (tmp_path / "no.h5").write_text("no")

@@ -193,6 +193,33 @@ def test_an_invalid_scene_exits_2_with_its_pointers(daemon, fbar, tmp_path):
     assert fbar("run", "dam-brake", url=daemon).returncode == 2
 
 
+def test_interrupted_run_goes_on_as_it_is_told(daemon, fbar, start_fbar, tmp_path):
+    """Ctrl-C pauses; the two commands that fbar then names lead to the recording of an undisturbed run."""
+    words = ["run", "dam-break", *SMALL, "--set", "output.interval=0.005"]
+    runner = start_fbar(*words, "--id", "stopped", "-o", "a.h5", url=daemon)
+    end, log = time.monotonic() + 30, tmp_path / "a.h5.log"
+    while not (log.exists() and log.stat().st_size > 200000):
+        assert runner.poll() is None and time.monotonic() < end
+        time.sleep(0.002)
+    runner.send_signal(signal.SIGINT)
+    _, err = runner.communicate(timeout=30)
+    assert runner.returncode == 130, err
+    assert json.loads(get(f"{daemon}/v1/runs/stopped"))["state"] == "paused", err
+    with h5py.File(tmp_path / "a.h5") as f:  # closed, and what is there is whole
+        assert f["fbard"].attrs["complete"] == 0 and len(f["fbard/frames/seq"]) > 2
+    told = re.findall(r"`fbar (.*?)`", err)
+    assert [line.split()[2] for line in told] == ["resume", "record"], err
+    for line in told:
+        done = fbar(*line.split(), timeout=60)
+        assert done.returncode == 0, done.stderr
+    assert fbar(*words, "--id", "whole-again", "-o", "b.h5", url=daemon, timeout=60).returncode == 0
+    with h5py.File(tmp_path / "a.h5") as a, h5py.File(tmp_path / "b.h5") as b:
+        assert a["fbard"].attrs["complete"] == 1
+        assert list(a["fbard/frames/step"]) == list(b["fbard/frames/step"])
+        for name in b["VTKHDF/PointData"]:
+            np.testing.assert_array_equal(a["VTKHDF/PointData"][name], b["VTKHDF/PointData"][name])
+
+
 def test_a_failing_run_exits_1_and_its_recording_is_whole(daemon, fbar, tmp_path):
     result = fbar("run", "dam-break", *SMALL, "--set", "time.cfl=null", "--set", "time.dt=0.02",
                   "--set", "time.unstable_ok=true", "--id", "fails", "-o", "a.h5", url=daemon)
