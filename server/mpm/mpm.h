@@ -455,6 +455,10 @@ struct mpm_balance {
 // Summed in a fixed order: the same bits for any number of threads.
 void mpm_balance(const struct mpm_sim *sim, struct mpm_balance *out);
 
+// max |ln(J/Jbar)| over all particles: how far the volume ratio has drifted from the one that the
+// stress uses; 0 as long as F-bar was never on, infinite where J is not positive.
+double mpm_drift(const struct mpm_sim *sim);
+
 // Seconds by phase since creation (all 0 without a clock); names are static.
 #define MPM_PHASE_LIST(X)                                                                          \
     X(SORT, "sort")                                                                                \

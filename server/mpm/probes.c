@@ -315,6 +315,14 @@ double mpm_kinetic_energy(const struct mpm_sim *sim) {
     return sum;
 }
 
+double mpm_drift(const struct mpm_sim *sim) {
+    double largest = 0;
+    for (size_t b = 0; b < sim->n_sets; b++) {
+        largest = fmax(largest, mpm_fbar_drift(&sim->sets[b]));
+    }
+    return largest;
+}
+
 void mpm_balance(const struct mpm_sim *sim, struct mpm_balance *out) {
     *out = (struct mpm_balance){.kinetic_energy = mpm_kinetic_energy(sim),
                                 .external_work = sim->c.external_work};
