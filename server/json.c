@@ -608,6 +608,10 @@ void json_pointer_append(char *out, size_t n, const char *token) {
 // cJSON prints a number with 15 digits where that is within one unit in the last place; a scene
 // that is posted back, or read again after a restart, must give the very same doubles.
 static void number_text(char out[32], double value) {
+    if (fabs(value) < 1e15 && value == (double)(int64_t)value && value != 0) {
+        snprintf(out, 32, "%lld", (long long)value); // most are counts, and this is the same text
+        return;
+    }
     for (int digits = 15; digits <= 17; digits++) {
         snprintf(out, 32, "%.*g", digits, value);
         if (strtod(out, NULL) == value)
@@ -648,6 +652,12 @@ char *json_print(const cJSON *json, bool indented) {
     if (copy && numbers_to_raw(copy))
         text = indented ? cJSON_Print(copy) : cJSON_PrintUnformatted(copy);
     cJSON_Delete(copy);
+    return text;
+}
+
+char *json_print_away(cJSON *json) {
+    char *text = json != NULL && numbers_to_raw(json) ? cJSON_PrintUnformatted(json) : NULL;
+    cJSON_Delete(json);
     return text;
 }
 

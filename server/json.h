@@ -49,3 +49,5 @@ void json_digest(const char *text, char *out);
 // The text of a value, freed with free: every number with the fewest digits that read back to the
 // same double, which cJSON's own printing does not promise.
 char *json_print(const cJSON *json, bool indented);
+// The same in one line, of a value that goes: no copy of it is made.
+char *json_print_away(cJSON *json);

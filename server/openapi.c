@@ -121,8 +121,8 @@ static const struct {
             ":{\"type\":\"integer\"}}}"},
     {"Text", "{\"type\":\"string\"}"},
     {"Runs",
-     "{\"type\":\"object\",\"required\":[\"runs\"],\"properties\":{\"runs\":{\"type\":\"arra"
-     "y\",\"items\":{\"$ref\":\"#/components/schemas/Run\"}}}}"},
+     "{\"type\":\"object\",\"required\":[\"runs\"],\"properties\":{\"older\":{\"type\":\"integer"
+     "\"},\"runs\":{\"type\":\"array\",\"items\":{\"$ref\":\"#/components/schemas/Run\"}}}}"},
     {"Step",
      "{\"type\":\"object\",\"additionalProperties\":false,\"minProperties\":1,\"maxPropertie"
      "s\":1,\"properties\":{\"steps\":{\"type\":\"integer\",\"minimum\":1},\"until\":{\"type"

@@ -48,8 +48,7 @@ void reply_text(struct http_reply *reply, int status, const char *type, char *te
 }
 
 void reply_json(struct http_reply *reply, int status, cJSON *json) {
-    reply_text(reply, status, "application/json", json != NULL ? json_print(json, false) : NULL);
-    cJSON_Delete(json);
+    reply_text(reply, status, "application/json", json_print_away(json));
 }
 
 // Length of the UTF-8 character at `c`, 0 when it is none.

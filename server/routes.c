@@ -57,7 +57,11 @@ const struct route routes_table[] = {
      "creates one run, however often it is sent",
      "409 503 507"},
     {"GET", "/v1/runs", routes_serve_runs, -1, "All runs, oldest first", NULL, false, false, 200,
-     "Runs", JSON, NULL, NULL},
+     "Runs", JSON,
+     "state: only runs in these states, with commas between\n"
+     "limit: only the newest so many; `older` counts those left out\n"
+     "before: only runs that are older than this one",
+     "400"},
     {"GET", "/v1/events", routes_serve_all_events, -1,
      "Server-sent events of all runs: run, gone, ready, end", NULL, false, false, 200, "Text",
      "text/event-stream", NULL, "503"},

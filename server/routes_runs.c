@@ -167,16 +167,68 @@ struct run *routes_run_of(struct call *c) {
     return run;
 }
 
+// "running,paused" -> bits by state. False when the reply is a 400.
+static bool states_asked(struct call *c, unsigned *out) {
+    char text[128], *rest = text;
+    *out = (1U << RUN_N_STATES) - 1;
+    if (!http_query(c->request, "state", text, sizeof text))
+        return true;
+    *out = 0;
+    for (char *word; (word = strsep(&rest, ",")) != NULL;) {
+        int state = run_state_parse(word);
+        if (state < 0) {
+            reply_problem(c->reply, 400, NULL,
+                          "state must be names of states with commas between, got \"%.40s\"", word);
+            return false;
+        }
+        *out |= 1U << state;
+    }
+    return true;
+}
+
+// Where the runs that are older than the one that `before` names end; all when it is not given.
+// False when the reply is a 400.
+static bool older_than(struct call *c, struct run **all, size_t *count) {
+    char id[RUN_ID_MAX + 1];
+    if (!http_query(c->request, "before", id, sizeof id))
+        return true;
+    size_t k = 0;
+    while (k < *count && strcmp(run_id(all[k]), id) != 0)
+        k++;
+    if (k == *count) {
+        reply_problem(c->reply, 400, NULL, "before must be the id of a run, got \"%.64s\"", id);
+        return false;
+    }
+    *count = k;
+    return true;
+}
+
 void routes_serve_runs(struct call *c) {
     size_t count;
+    uint64_t limit, listed = 0, older = 0;
+    unsigned states;
+    if (!states_asked(c, &states) || !routes_query_number(c, "limit", UINT64_MAX, &limit))
+        return;
     struct run **all = runs_all(c->routes->runs, &count);
-    cJSON *json = cJSON_CreateObject(), *list = cJSON_AddArrayToObject(json, "runs");
-    for (size_t k = 0; k < count; k++) {
-        cJSON_AddItemToArray(list, routes_run_json(all[k]));
-        run_release(all[k]);
+    size_t end = count;
+    if (older_than(c, all, &end)) {
+        cJSON *json = cJSON_CreateObject(), *list = cJSON_AddArrayToObject(json, "runs");
+        for (size_t k = end; k > 0; k--) { // the newest of them, oldest first
+            if ((states >> run_status(all[k - 1]).state & 1) == 0)
+                continue;
+            if (listed == limit) {
+                older++;
+                continue;
+            }
+            cJSON_InsertItemInArray(list, 0, routes_run_json(all[k - 1]));
+            listed++;
+        }
+        reply_add(json, "older", (double)older);
+        reply_json(c->reply, 200, json);
     }
+    for (size_t k = 0; k < count; k++)
+        run_release(all[k]);
     free(all);
-    reply_json(c->reply, 200, json);
 }
 
 void routes_serve_run(struct call *c) {

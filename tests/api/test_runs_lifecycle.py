@@ -585,3 +585,27 @@ def test_creation_with_a_key_by_many_at_once(daemon, name):
 def test_creation_with_a_bad_key_is_refused(daemon, bad):
     reply = daemon.ask("POST", "/v1/runs", {"scene": water()}, {"Idempotency-Key": bad.encode()}, status=400)
     assert "Idempotency-Key" in reply.json["detail"]
+
+
+def test_list_can_be_narrowed_and_paged(fresh):
+    d = fresh().start()
+    made = [d.create(water(time={"end": 0.01}), id=f"r{k}", start=k % 2 == 0)["id"] for k in range(7)]
+    for run in made[::2]:
+        d.wait(run, "completed")
+
+    def listed(query):
+        answer = d.get("/v1/runs" + query)
+        return [r["id"] for r in answer["runs"]], answer["older"]
+
+    assert listed("") == (made, 0)
+    assert listed("?state=paused") == (made[1::2], 0)
+    assert listed("?state=completed,paused&limit=3") == (made[4:], 4)
+    assert listed("?state=failed") == ([], 0) and listed("?limit=0") == ([], 7)
+    pages, before = [], ""
+    while not pages or before:
+        page, older = listed("?limit=3" + before)
+        pages = page + pages
+        before = f"&before={page[0]}" if older else ""
+    assert pages == made
+    for bad in ("?state=gone", "?state=", "?limit=-1", "?limit=many", "?before=nobody", "?before="):
+        d.ask("GET", "/v1/runs" + bad, status=400)
