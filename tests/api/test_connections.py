@@ -1,5 +1,6 @@
 """Connections that ask nothing, or ask slowly, keep nobody out."""
 import contextlib
+import select
 import shutil
 import socket
 import subprocess
@@ -152,3 +153,36 @@ def test_slowhttptest_leaves_the_api_answering(daemon, how):
         attack.kill()
         attack.wait()
     assert asked > 20 and slowest < SOON, f"{slowest:.2f} s at worst of {asked}"
+
+
+@pytest.mark.long
+def test_idle_connections_end_after_30_s_and_streams_are_kept_by_heartbeats(daemon, name):
+    daemon.create(endless(), id=name, start=False)
+    with held(daemon, 1) as nothing, held(daemon, 1, b"GET /healthz HTTP/1.1\r\nHost: localhost\r\n\r\n") as kept, \
+            Stream(daemon, f"/v1/runs/{name}/events") as stream:  # fmt: skip
+        began, ended, beats = time.monotonic(), {}, []
+        sockets = {nothing[0]: "nothing", kept[0]: "kept alive", stream.answer.fp.raw._sock: "stream"}
+        kept[0].recv(4096)
+        while time.monotonic() < began + 45:
+            for s in select.select([s for s in sockets if s not in ended], [], [], 1)[0]:
+                part = s.recv(4096)
+                if not part:
+                    ended[s] = time.monotonic() - began
+                elif sockets[s] == "stream" and b": still here" in part:
+                    beats.append(time.monotonic() - began)
+    ended = {sockets[s]: t for s, t in ended.items()}
+    assert set(ended) == {"nothing", "kept alive"}, "the stream stays"
+    assert all(29 < t < 40 for t in ended.values()), ended
+    assert len(beats) in (3, 4), beats
+    daemon.away(name)
+
+
+def test_streams_whose_readers_go_are_given_back_though_nothing_is_sent(daemon, name):
+    daemon.create(endless(), id=name, start=False)
+    streams = [Stream(daemon, f"/v1/runs/{name}/{kind}") for kind in ("events", "stream") * 8]
+    assert metrics(daemon)["fbard_streams", ""] == 16
+    for stream in streams:
+        stream.answer.close()
+        stream.connection.close()
+    until(lambda: metrics(daemon)["fbard_streams", ""] == 0, 10)
+    daemon.away(name)
