@@ -6,6 +6,7 @@ import time
 import pytest
 from boxes import big, endless, water
 from fbard import FINAL, STATES, is_sanitized, until
+from frames import Frame
 
 
 def test_hammered_runs_stay_consistent(daemon):
@@ -175,3 +176,23 @@ def test_thousand_runs_come_and_go(daemon):
     until(lambda: daemon.descriptors() <= descriptors + 4 and daemon.n_threads() <= threads + 4)
     if not is_sanitized():
         assert daemon.memory() < memory + 20e6
+
+
+def test_runs_side_by_side_share_the_cores_fairly_and_keep_their_bits(fresh):
+    """More threads than cores where there are two or three; each run ends as when it is alone."""
+    d = fresh(slots=4, threads=1).start()
+    scene = water(time={"end": 0.5}, output={"interval": 0.1})
+    d.create(scene, id="alone")
+    d.wait("alone", "completed")
+    runs = [d.create(scene, id=f"r{k}")["id"] for k in range(4)]
+    until(lambda: max(d.run(run)["step"] for run in runs) >= 250)
+    steps = [d.run(run)["step"] for run in runs]
+    # Equal threads get equal shares of the kernel: a third of the fastest is far from its noise.
+    assert min(steps) > max(steps) / 3, steps
+    for run in runs:
+        d.wait(run, "completed")
+        assert [f["step"] for f in d.frames(run)] == [f["step"] for f in d.frames("alone")]
+        for f in d.frames(run):
+            a, b = (Frame(d.frame(r, f["seq"])).fields for r in (run, "alone"))
+            assert all((a[name] == b[name]).all() for name in a), (run, f)
+        assert d.csv(run) == d.csv("alone")

@@ -175,14 +175,3 @@ def test_idle_connections_end_after_30_s_and_streams_are_kept_by_heartbeats(daem
     assert all(29 < t < 40 for t in ended.values()), ended
     assert len(beats) in (3, 4), beats
     daemon.away(name)
-
-
-def test_streams_whose_readers_go_are_given_back_though_nothing_is_sent(daemon, name):
-    daemon.create(endless(), id=name, start=False)
-    streams = [Stream(daemon, f"/v1/runs/{name}/{kind}") for kind in ("events", "stream") * 8]
-    assert metrics(daemon)["fbard_streams", ""] == 16
-    for stream in streams:
-        stream.answer.close()
-        stream.connection.close()
-    until(lambda: metrics(daemon)["fbard_streams", ""] == 0, 10)
-    daemon.away(name)
