@@ -223,7 +223,8 @@ void routes_serve_runs(struct call *c) {
             cJSON_InsertItemInArray(list, 0, routes_run_json(all[k - 1]));
             listed++;
         }
-        reply_add(json, "older", (double)older);
+        if (limit != UINT64_MAX)
+            reply_add(json, "older", (double)older);
         reply_json(c->reply, 200, json);
     }
     for (size_t k = 0; k < count; k++)
