@@ -12,7 +12,8 @@
 
 extern bool quick;
 
-double now(void); // s
+double now(void);      // s, processor time of this thread
+double wall_now(void); // s
 double median(const double *values, int n);
 // Seconds of a fused multiply-add of one double, in the widest vectors that the kernels use.
 double fma_seconds(void);

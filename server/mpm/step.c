@@ -10,7 +10,6 @@
 
 #include "server/mpm/sim.h"
 
-#define TILES_A_TURN 2  // tiles that a thread takes at a time
 #define SLOTS_A_PART 64 // blocks of nodes that a thread takes at a time
 #define UNSTABLE_CFL                                                                               \
     1.0 // no basis is stable at dt >= 0.9 h/c (docs/method.md): beyond this it is not tried
@@ -118,7 +117,10 @@ static void for_tiles(const struct mpm_sim *sim, size_t body, struct mpm_span sp
                             order->tile[next].begin, work, &sim->results[t]);
                 }
             }
-            for (int part = own; colour + 1 < order->n_colours && part < n_threads; part += there) {
+            if (colour + 1 == order->n_colours) {
+                break; // the region's end is a barrier, too
+            }
+            for (int part = own; part < n_threads; part += there) {
                 atomic_store(&sim->turns[part].next[(colour + 1) % 2],
                              part_begin(order, colour + 1, part, n_threads));
             }
@@ -127,15 +129,30 @@ static void for_tiles(const struct mpm_sim *sim, size_t body, struct mpm_span sp
     }
 }
 
-// All other work goes in chunks of equal size.
+// All other work goes in chunks of equal size. They do not take equal time, since what flows costs
+// more: first one's own part, as with tiles, then what others have not begun.
 static size_t for_chunks(const struct mpm_sim *sim, struct mpm_span span, span_work *work) {
     const size_t n = span.s->n, n_chunks = (n + MPM_CHUNK - 1) / MPM_CHUNK;
     const int n_threads = sim->def->n_threads;
-    (void)n_threads; // without OpenMP
-#pragma omp parallel for schedule(static) num_threads(n_threads) if (n_threads > 1)
-    for (size_t k = 0; k < n_chunks; k++) {
-        const size_t begin = k * MPM_CHUNK, end = begin + MPM_CHUNK;
-        work_on(sim, span, begin, end < n ? end : n, end < n ? end : begin, work, &sim->results[k]);
+    for (int k = 0; k < n_threads; k++) {
+        atomic_store(&sim->turns[k].next[0], n_chunks * (size_t)k / (size_t)n_threads);
+    }
+#pragma omp parallel num_threads(n_threads) if (n_threads > 1)
+    {
+#ifdef _OPENMP
+        const int own = omp_get_thread_num();
+#else
+        const int own = 0;
+#endif
+        for (int k = 0; k < n_threads; k++) {
+            const int part = (own + k) % n_threads;
+            const size_t part_end = n_chunks * (size_t)(part + 1) / (size_t)n_threads;
+            for (size_t i; (i = atomic_fetch_add(&sim->turns[part].next[0], 1)) < part_end;) {
+                const size_t begin = i * MPM_CHUNK, end = begin + MPM_CHUNK;
+                work_on(sim, span, begin, end < n ? end : n, end < n ? end : begin, work,
+                        &sim->results[i]);
+            }
+        }
     }
     return n_chunks;
 }
@@ -355,6 +372,14 @@ static void particles_to_grid(struct mpm_sim *sim, double dt, bool any_fbar, dou
     }
 }
 
+static bool takes_part_in_fbar(const struct mpm_sim *sim) {
+    bool any = false;
+    for (size_t b = 0; b < sim->n_sets; b++) {
+        any |= sim->sets[b].wants_fbar;
+    }
+    return any && sim->c.now.fbar.scheme != MPM_FBAR_OFF;
+}
+
 enum mpm_status mpm_step(struct mpm_sim *sim, struct mpm_error *err) {
     const struct mpm_settings *now = &sim->c.now;
     const int dim = sim->grid.dim, n_threads = sim->def->n_threads;
@@ -376,7 +401,7 @@ enum mpm_status mpm_step(struct mpm_sim *sim, struct mpm_error *err) {
 
     // P2G, eqs. 7, 8, 10
     const enum mpm_fbar_scheme scheme = now->fbar.scheme;
-    const bool any_fbar = scheme != MPM_FBAR_OFF;
+    const bool any_fbar = takes_part_in_fbar(sim);
     sim->grid.fbar_stride = mpm_fbar_scalars(scheme);
     particles_to_grid(sim, dt, any_fbar, &clock);
 
