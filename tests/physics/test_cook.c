@@ -238,10 +238,13 @@ static void test_cook_pressure_of_fbar(void **state) {
 }
 
 // h = 1 at the paper's time. Algorithm 1 creeps (docs/method.md), so that only its pressure is
-// compared. The standard quadratic B-spline's pressure is off by 1.33 over all particles, as a
-// prototype's was (1.30), and by 0.67 without those 6 m around the corner (0.87 at 120 s; 0.57 with
-// local damping 0.75; folded walls or not): its noise sits at the edges, 1.4 within two cells of
-// them and 0.23 away from them. uGIMP's is everywhere: 4.65 (a prototype: 4.67) and 4.04.
+// compared. Standard quadratic B-splines: the pressure is off by 1.34 over all particles and by
+// 0.67 without those 6 m around the corner, since its noise sits at the edges: 1.4 within two cells
+// of them, 0.23 away from them. A prototype's 1.30 must be with the corner, then. An independent
+// transcription of the method (other code for basis, walls, law and sums; particles from the FEM's
+// table) gives the same three digits at 38 s: 1.338, 0.666 and -2.68 % for the column; with the
+// clamp's nodes held instead of folded 1.249 and 0.655. uGIMP's noise is everywhere: 4.653 and
+// 4.043 in both codes (a prototype: 4.67).
 static void test_cook_at_h_1(void **state) {
     (void)state;
     if (!getenv("FBARD_LONG")) {
@@ -249,8 +252,8 @@ static void test_cook_at_h_1(void **state) {
     }
     below(3, run(1, MPM_GIMP, MPM_FBAR_OFF, 0.3, 38).pressure);
     const struct errors smooth = run(1, MPM_BSPLINE2, MPM_FBAR_OFF, 0.3, 38);
-    below(0.5, smooth.pressure);
-    below(1, smooth.everywhere);
+    below(0.6, smooth.pressure);
+    below(1.2, smooth.everywhere);
     for (int basis = MPM_GIMP; basis <= MPM_BSPLINE3; basis++) {
         below(run(1, basis, MPM_FBAR_ZHAO, 0.3, 38).pressure, 0.2);
         below(run(1, basis, MPM_FBAR_ANCHORED, 0.3, 38).pressure, 0.2);
