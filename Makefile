@@ -6,7 +6,9 @@ PACKAGES = build-essential pkg-config libmicrohttpd-dev libcjson-dev libzmq3-dev
 	libcurl4-gnutls-dev libxxhash-dev libcmocka-dev gnuplot-nox fonts-dejavu-core curl openssl \
 	python3 python3-numpy python3-h5py python3-pytest python3-zmq python3-jsonschema \
 	python3-hypothesis slowhttptest libjs-chart.js
-# Needed by some targets only: clang builds and the fuzzers; `make check-long`.
+# Needed by some targets only: the browser that tests the live page, and npm where there is no other one; clang
+# builds and the fuzzers; `make check-long`.
+PACKAGES_PAGE = chromium $(if $(shell command -v npm),,nodejs npm)
 PACKAGES_CLANG = clang-14 libomp-14-dev
 PACKAGES_LONG = $(PACKAGES_CLANG) python3-paraview prometheus zsh groff-base systemd
 # Pictures of the report; `make check` tests it, and so needs them too.
@@ -77,7 +79,8 @@ $(B)/obj/server/mpm/kernels.o: ALL_CFLAGS += $(if $(LEVELS),-DMPM_HAS_LANES)
 LANES_FLAGS = $(if $(filter asan tsan debug coverage,$(VARIANT)),-O1,-O2) -fno-tree-vectorize -fno-tree-slp-vectorize
 $(call levels,$(LANES_SRC)): ALL_CFLAGS += $(LANES_FLAGS)
 
-.PHONY: all programs deps deps-long deps-report libmpm demo report report-page report-docs check check-all check-layers check-unit check-physics check-api \
+.PHONY: all programs deps deps-page deps-long deps-report libmpm demo report report-page report-docs check check-all check-layers check-unit \
+	check-physics check-api check-page \
 	check-cli check-loss check-asan check-clang check-fuzz check-tsan unit-programs check-long bench bench-solver bench-peer \
 	bench-recording bench-status fuzz install uninstall format clean help
 .DELETE_ON_ERROR:
@@ -193,11 +196,14 @@ deps: ## install what is missing (Debian packages; as root or with sudo)
 deps-long: deps
 	@$(MAKE) --no-print-directory deps PACKAGES="$(PACKAGES_LONG)"
 
+deps-page: deps-report
+	@$(MAKE) --no-print-directory deps PACKAGES="$(PACKAGES_PAGE)"
+
 deps-report: deps
 	@$(MAKE) --no-print-directory deps PACKAGES="$(PACKAGES_REPORT)"
 
 # Everything that a commit must pass. deps first, alone: what follows asks pkg-config.
-check: deps-report ## build and run all tests (installs what is missing)
+check: deps-page ## build and run all tests (installs what is missing)
 	@$(MAKE) --no-print-directory -j$$(nproc) all programs
 	@$(MAKE) --no-print-directory check-all
 
@@ -205,7 +211,7 @@ check: deps-report ## build and run all tests (installs what is missing)
 programs: $(UNIT) $(PHYSICS) $(FUZZ) $(B)/tests/failing.so
 
 check-all: all
-	$(Q)$(MAKE) --no-print-directory check-layers check-unit check-physics check-api check-cli check-loss
+	$(Q)$(MAKE) --no-print-directory check-layers check-unit check-physics check-api check-page check-cli check-loss
 	$(Q)$(MAKE) --no-print-directory check-asan
 
 check-layers: all
@@ -228,6 +234,15 @@ check-api: all ## black-box tests of the daemon
 
 check-cli: all ## black-box tests of the client
 	$(Q)FBARD=$(CURDIR)/$(B)/fbard FBAR=$(CURDIR)/$(B)/fbar $(PYTEST) tests/cli
+
+# The lock file's playwright-core drives Debian's chromium; it is installed into build/page, never into the tree.
+PAGE_MODULES = build/page/node_modules
+$(PAGE_MODULES)/.installed: tests/page/package.json tests/page/package-lock.json tests/page/.npmrc
+	$(call say,NPM,$(@D))
+	@mkdir -p build/page && cp $^ build/page
+	$(Q)cd build/page && npm ci --ignore-scripts --silent && touch node_modules/.installed
+check-page: all $(PAGE_MODULES)/.installed ## the live page in a real browser
+	$(Q)FBARD=$(CURDIR)/$(B)/fbard PAGE_MODULES=$(CURDIR)/build/page node --test --test-reporter=spec tests/page/page.test.mjs
 
 # Preloaded by tests of check-loss: calls on the disk that fail.
 $(B)/tests/failing.so: tests/loss/failing.c
@@ -275,7 +290,7 @@ check-clang: ## warnings and unit tests with clang 14
 	$(Q)$(MAKE) --no-print-directory CC=clang-14 VARIANT=clang OPENMP=-fopenmp=libomp CFLAGS=-Werror \
 	  build/clang/fbard build/clang/fbar check-unit
 
-check-long: deps-long deps-report ## the longer verification: minutes to hours
+check-long: deps-long deps-page ## the longer verification: minutes to hours
 	@FBARD_LONG=1 $(MAKE) --no-print-directory check-all check-clang check-tsan
 
 bench: bench-solver bench-recording bench-status ## speed: the kernels, what recording costs, how fast the daemon answers

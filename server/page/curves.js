@@ -31,10 +31,14 @@ const bars = {
   beforeDatasetsDraw(chart) {
     const { y } = chart.scales;
     const ctx = chart.ctx;
+    const { left, top, width, height } = chart.chartArea;
     for (const [k, set] of chart.data.datasets.entries()) {
       if (!set.isReference) continue;
       const points = chart.getDatasetMeta(k).data;
       ctx.save();
+      ctx.beginPath();
+      ctx.rect(left - 6, top, width + 12, height);
+      ctx.clip();
       ctx.strokeStyle = set.borderColor;
       ctx.lineWidth = 1.5;
       for (const [p, point] of points.entries()) {
@@ -89,7 +93,14 @@ export class Curves {
   create(name) {
     const canvas = h("canvas", { role: "img" });
     const value = h("span", { class: "value" });
-    const box = h("figure", { class: "curve" }, h("figcaption", {}, h("span", { class: "name" }, name), value), h("div", { class: "plot" }, canvas));
+    const log = h("button", { class: "log", "aria-pressed": "false", "aria-label": `${name}: logarithmic scale`, title: "Logarithmic scale (of what is above 0)" }, "log");
+    log.addEventListener("click", () => {
+      const on = log.getAttribute("aria-pressed") === "false";
+      log.setAttribute("aria-pressed", String(on));
+      chart.options.scales.y.type = on ? "logarithmic" : "linear";
+      chart.update("none");
+    });
+    const box = h("figure", { class: "curve" }, h("figcaption", {}, h("span", { class: "name" }, name), value, log), h("div", { class: "plot" }, canvas));
     this.place.append(box);
     const chart = new Chart(canvas, {
       type: "line",

@@ -26,7 +26,9 @@ export function thinning(most, field) {
 }
 
 export class RunData {
-  constructor(run) {
+  // `updated` is called whenever something new is there.
+  constructor(run, updated) {
+    this.updated = updated;
     this.id = run.id;
     this.created = run.created;
     this.frames = [];
@@ -47,7 +49,7 @@ export class RunData {
     this.stale = true;
   }
 
-  // Brings it up to `run`; calls that come meanwhile are one more round. Resolves to whether all is there.
+  // Brings it up to `run`; calls that come meanwhile are one more round.
   sync(run) {
     this.next = run;
     this.busy ??= this.rounds().finally(() => {
@@ -68,6 +70,7 @@ export class RunData {
         throw error;
       }
       if (this.stale) this.next ??= run;
+      this.updated(); // each round: where news come faster than answers there is no last one
     }
   }
 

@@ -39,6 +39,7 @@ function away() {
   connection("away", "not connected");
   banner.hidden = false;
   say(banner, `fbard does not answer${heardAt ? `; last heard at ${heardAt.toLocaleTimeString()}` : ""}. What you see is from then. Trying again by itself.`);
+  drawHead(); // nothing can be asked for now
 }
 
 function back() {
@@ -171,15 +172,14 @@ async function bring(run) {
   if (run.id === selected) drawHead();
   let data = datas.get(run.id);
   if (data === undefined) {
-    data = new RunData(run);
+    data = new RunData(run, draw);
     datas.set(run.id, data);
   }
   try {
     await data.sync(run);
   } catch {
-    return; // the daemon is away: its return brings all again
+    // the daemon is away: its return brings all again
   }
-  draw();
 }
 
 const shown = () =>
@@ -382,10 +382,13 @@ async function attempt(what, call) {
   }
 }
 
-async function act(verb, body) {
-  const id = selected;
-  const run = await attempt(verb, async () => (await ask("POST", path(id, `:${verb}`), { body })).json());
-  if (run !== null) heard(run);
+// What came of it the events tell: an answer may be overtaken by them, and would then be out of date.
+function act(verb, body) {
+  return attempt(verb, () => ask("POST", path(selected, `:${verb}`), { body }));
+}
+
+function created(run) {
+  if (!runs.has(run.id)) heard(run);
 }
 
 byId("go").addEventListener("click", () => act(MOVING.has(runs.get(selected)?.state) ? "pause" : "resume"));
@@ -428,7 +431,7 @@ byId("twin").addEventListener("click", async () => {
     return (await ask("POST", "/v1/runs", { body })).json();
   });
   if (twin === null) return;
-  heard(twin);
+  created(twin);
   select(run.id, twin.id);
 });
 byId("csv").addEventListener("click", async () => {
@@ -440,7 +443,7 @@ byId("csv").addEventListener("click", async () => {
 byId("more").addEventListener("toggle", () => runs.has(selected) && drawDetails(runs.get(selected)));
 
 onMade((run) => {
-  heard(run);
+  created(run);
   select(run.id);
 });
 byId("new").addEventListener("click", () => openCreate());
@@ -450,7 +453,7 @@ document.addEventListener("click", (event) => {
   if (wish === "example")
     attempt("dam break", async () => {
       const run = await (await ask("POST", "/v1/runs", { body: { scene: "dam-break" } })).json();
-      heard(run);
+      created(run);
       select(run.id);
     });
 });

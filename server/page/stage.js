@@ -253,6 +253,7 @@ function accept(pane, frame, key = asked()) {
   pane.note.textContent = "";
   upload(pane);
   paint();
+  tell();
 }
 
 // ---- Drawing ----------------------------------------------------------------------------------
