@@ -22,6 +22,7 @@ static const struct option_spec options[] = {
     {"set", 's', "KEY=VALUE",
      "override a value of the scene, as in --set materials.water.density=1e3"},
     {"id", 0, "ID", "name of the run"},
+    {"detach", 'd', NULL, "leave the run to the daemon and end at once (without -o)"},
     {"compress", 0, "1..9", "shuffle and deflate the recording"},
     {NULL, 0, NULL, NULL},
 };
@@ -148,6 +149,18 @@ static int follow(struct client *client, const struct arguments *arguments, cons
     return code;
 }
 
+// What a run that was left to the daemon is called.
+static void report_detached(const struct client *client, const cJSON *run, const char *id) {
+    if (client->json) {
+        report_json(run);
+        return;
+    }
+    puts(id);
+    terminal_note("%s runs in the daemon; `fbar watch %s` looks at it, `fbar record %s -o FILE.h5` "
+                  "records it",
+                  id, id, id);
+}
+
 static int create_and_follow(struct client *client, const struct arguments *arguments,
                              const char *body, bool private) {
     cJSON *run;
@@ -155,7 +168,11 @@ static int create_and_follow(struct client *client, const struct arguments *argu
     if (code != CLIENT_DONE)
         return code;
     const char *id = cJSON_GetStringValue(cJSON_GetObjectItemCaseSensitive(run, "id"));
-    const int result = follow(client, arguments, id ? id : "", private);
+    int result = CLIENT_DONE;
+    if (arguments_flag(arguments, "detach"))
+        report_detached(client, run, id ? id : "");
+    else
+        result = follow(client, arguments, id ? id : "", private);
     cJSON_Delete(run);
     return result;
 }
@@ -165,6 +182,12 @@ static int run(struct client *client, const struct arguments *arguments) {
     double compress = 0;
     if (arguments_number(arguments, "compress", 1, 9, &compress) != 0)
         return CLIENT_USAGE;
+    const bool detach = arguments_flag(arguments, "detach");
+    if (detach && file) {
+        terminal_error("--detach and --output exclude each other; `fbar record` records a run that "
+                       "is on its way, from its first frame");
+        return CLIENT_USAGE;
+    }
     if (file) { // better now than after an hour
         const int code = recorder_check_file(file, arguments_value(arguments, "id"));
         if (code != CLIENT_DONE)
@@ -174,8 +197,9 @@ static int run(struct client *client, const struct arguments *arguments) {
     if (!body)
         return CLIENT_USAGE;
     struct daemon daemon;
-    struct client own;
-    int code = daemon_reach(client, &daemon, &own);
+    struct client asked = *client, own;
+    asked.url_given = client->url_given || detach; // a private daemon would end with this command
+    int code = daemon_reach(&asked, &daemon, &own);
     if (code == CLIENT_DONE) {
         code = create_and_follow(&own, arguments, body, daemon_private(&daemon));
         daemon_leave(&daemon, &own);
@@ -195,6 +219,7 @@ const struct command cmd_run = {
            "go on; a second one leaves at once. Values are JSON, or else text.",
     .examples = "fbar run dam-break -o dam.h5\n"
                 "fbar run dam-break -o off.h5 --set fbar=false --set time.end=0.5\n"
+                "fbar run dam-break --id dam --detach\n"
                 "fbar run my-scene.json -o mine.h5 --set materials.water.density=1e3",
     .least = 1,
     .most = 1,

@@ -41,7 +41,8 @@ def test_json_of_every_command_is_json(fbar, fake, recording):
         result = fbar("--json", command, *words, url=daemon.url)
         assert result.returncode == (4 if command == "recover" else 0), (command, result.stderr)
         assert isinstance(parsed(result), dict), command
-        assert parsed(fbar(command, "--json", *words, "--nonsense", url=daemon.url))["exit_code"] == 2
+    for command in ("list", "plot"):
+        assert parsed(fbar(command, "--json", *lines[command], "--nonsense", url=daemon.url))["exit_code"] == 2
     assert parsed(fbar("--json", "--version"))["version"] == fbar("--version").stdout.split()[1]
 
 
@@ -102,3 +103,14 @@ def test_messages_say_what_to_do_next(fbar, fake, recording, tmp_path):
     assert result.returncode == 4 and "holds the run r1; choose another -o" in result.stderr
     os.chmod(tmp_path / "a.h5", 0o444)
     assert fbar("info", "a.h5").returncode == 0
+
+
+def test_a_detached_run_is_left_to_the_daemon(fbar, fake):
+    daemon = fake()
+    result = fbar("run", "fake", "--id", "r1", "--detach", url=daemon.url)
+    assert result.returncode == 0 and result.stdout == "r1\n" and "fbar watch r1" in result.stderr
+    assert parsed(fbar("--json", "run", "fake", "-d", url=daemon.url))["id"] == "r1"
+    posted = [body for method, path, body in daemon.bodies if path == "/v1/runs"]
+    assert len(posted) == 2 and all("recorders" not in body for body in posted)
+    assert fbar("run", "fake", "--detach", "-o", "a.h5", url=daemon.url).returncode == 2
+    assert fbar("run", "fake", "--detach", url="http://127.0.0.1:1").returncode == 3

@@ -22,7 +22,12 @@ pytestmark = pytest.mark.skipif(not os.access(conftest.FBARD, os.X_OK), reason="
 
 def commands():
     """[[word, ...]] in the order of the README, without comments."""
-    text = "".join(re.findall(r"^```sh\n(.*?)^```$", README, re.M | re.S)).replace("\\\n", " ")
+    return read_commands(conftest.ROOT / "README.md")
+
+
+def read_commands(path):
+    """The lines of a page's sh blocks."""
+    text = "".join(re.findall(r"^```sh\n(.*?)^```$", path.read_text(), re.M | re.S)).replace("\\\n", " ")
     return [words for words in (shlex.split(line, comments=True) for line in text.splitlines()) if words]
 
 
@@ -94,31 +99,92 @@ def test_client_lines(url, tmp_path):
 
 def test_make_lines():
     """The targets exist, those named in the text too; running them is their own business."""
-    shown = [words[1] for words in commands() if words[0] == "make"]
-    assert {"demo", "check"} <= set(shown)
+    shown = [word for words in commands() if words[0] == "make" for word in words[1:]]
+    assert {"deps", "all"} <= set(shown) and "`make demo`" in README and "`make check`" in README
     for target in {*shown, *re.findall(r"`make ([a-z-]+)`", README)}:
         done = subprocess.run(["make", "-n", target], cwd=conftest.ROOT, capture_output=True, text=True,
                               env={k: v for k, v in os.environ.items() if k not in ("MAKEFLAGS", "MFLAGS")})
         assert done.returncode == 0, done.stderr
 
 
-def test_links_lead_somewhere():
-    """Files exist; headings have the place that GitHub gives them. The web is not asked."""
-    places = {re.sub(r"[^\w -]", "", h.lower()).replace(" ", "-") for h in
-              re.findall(r"^#+ (.*)$", re.sub(r"^```.*?^```$", "", README, flags=re.M | re.S), re.M)}
-    links = re.findall(r"\]\(([^)\s]+)\)", README)
-    assert len(links) > 5
+def places(path):
+    """The places of a file's headings, as GitHub names them, and those that it names itself."""
+    text = re.sub(r"^```.*?^```$", "", path.read_text(), flags=re.M | re.S)
+    return {re.sub(r"[^\w -]", "", h.lower()).replace(" ", "-") for h in re.findall(r"^#+ (.*)$", text, re.M)} | set(
+        re.findall(r'<a id="([^"]+)"', text))
+
+
+@pytest.mark.parametrize("name", ["README.md", "scenes/README.md", *(f"docs/{p.name}" for p in sorted(
+    (conftest.ROOT / "docs").glob("*.md")))])
+def test_links_lead_somewhere(name):
+    """Files and headings exist. The web is not asked."""
+    page = conftest.ROOT / name
+    links = re.findall(r"\]\(([^)\s]+)\)", re.sub(r"^```.*?^```$", "", page.read_text(), flags=re.M | re.S))
+    assert len(links) > 5 or name != "README.md"
     for link in links:
-        if link.startswith("#"):
-            assert link[1:] in places, link
-        elif "://" not in link:
-            assert (conftest.ROOT / link.split("#")[0]).is_file(), link
+        if "://" in link:
+            continue
+        file, _, place = link.partition("#")
+        target = page.parent / file if file else page
+        assert target.exists(), f"{name}: {link}"
+        assert not place or target.suffix != ".md" or place in places(target), f"{name}: {link}"
 
 
 def test_nothing_is_left_out():
     assert {words[0] for words in commands()} <= {"make", "curl", "build/fbar"}
     for command in re.findall(r"`build/fbar ([a-z]+)`", README):
-        assert f"\n  {command} " in subprocess.run([conftest.FBAR, "--help"], capture_output=True,
-                                                   text=True).stdout
+        assert command == "help" or f"\n  {command} " in subprocess.run(
+            [conftest.FBAR, "--help"], capture_output=True, text=True).stdout
     for picture in re.findall(r"!\[[^]]*\]\(([^)]+)\)", README):
         assert pathlib.Path(conftest.ROOT / picture).stat().st_size <= 250_000
+
+
+# ---- docs/tutorial.md -----------------------------------------------------------------------------------
+
+TUTORIAL = conftest.ROOT / "docs" / "tutorial.md"
+# Full-size runs of the tutorial, made short; the one that is steered ends soon after it was.
+MADE_SHORT = [*SHORT[:-1], "time.end=0.42"]
+
+
+def test_tutorial_lines_work_in_their_order(url, tmp_path):
+    """From a clean home, word for word, but for the length of the runs and where the daemon listens."""
+    folder, home = tmp_path / "clone", tmp_path / "home"
+    (folder / "build").mkdir(parents=True)
+    home.mkdir()
+    for program, path in (("fbar", conftest.FBAR), ("fbard", conftest.FBARD)):
+        os.symlink(path, folder / "build" / program)
+    environment = {"PATH": os.environ["PATH"], "HOME": str(home), "TMPDIR": str(tmp_path)}
+    lines, steered = read_commands(TUTORIAL), []
+    assert [words for words in lines if words[0] == "make"] == [["make", "deps"], ["make"]]
+    assert ["build/fbard", "&"] in lines
+    for words in lines:
+        if words[0] == "make":
+            continue
+        if words == ["build/fbard", "&"]:  # `url` is that daemon, at another address
+            environment["FBAR_URL"] = url
+            continue
+        assert words[0] == "build/fbar", f"no test runs {words}"
+        more = []
+        if words[1] == "run" and "--detach" in words:
+            more = ["--set", "output.interval=0.01"]
+            steered = ["show", words[words.index("--id") + 1]]
+        elif words[1] == "run" and words[2] == "dam-break":
+            more = MADE_SHORT
+        elif words[1] == "record":  # what was steered ends a thousand steps later
+            run = json.loads(subprocess.run([conftest.FBAR, "--json", *steered], capture_output=True, text=True,
+                                            env=environment).stdout)  # fmt: skip
+            subprocess.run([conftest.FBAR, "set", steered[1], f"time.end={max(run['time'], 0) + 0.01}"], env=environment,
+                           check=True, capture_output=True)  # fmt: skip
+        line = " ".join(shlex.quote(w) if w != ">" else w for w in [*words, *more])
+        done = subprocess.run(["sh", "-c", line], cwd=folder, env=environment, capture_output=True, text=True, timeout=100)
+        assert done.returncode == 0, (line, done.stdout, done.stderr)
+        for flag, name in zip(words, words[1:]):
+            if flag == "-o":
+                start = (folder / name).read_bytes()[:4]
+                assert start == (b"\x89PNG" if name.endswith(".png") else b"\x89HDF"), line
+    run = json.loads(subprocess.run([conftest.FBAR, "--json", *steered], capture_output=True, text=True,
+                                    env=environment).stdout)  # fmt: skip
+    assert run["fbar"] is True and [change["patch"] for change in run["changes"]][0] == {"fbar": True}
+    assert json.loads((folder / "mine.json").read_text())["format"] == "fbard-scene-1"
+    for command in re.findall(r"`build/fbar ([a-z]+)", TUTORIAL.read_text()):
+        assert command == "help" or command in {word for words in lines for word in words[1:2]} | {"watch", "completion"}
