@@ -143,6 +143,9 @@ static int follow(struct client *client, const struct arguments *arguments, cons
             code = outcome;
         else if (!private)
             say_how_to_go_on(client, run, id, file);
+        else
+            terminal_note("the run is over: its daemon was its own; under `fbard` it would have "
+                          "been paused, to go on later");
     }
     cJSON_Delete(run);
     free(path);

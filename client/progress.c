@@ -8,8 +8,11 @@
 #include "client/terminal.h"
 
 #define MOST_CELLS 24
-// Columns that the words need; what is left goes to the bar.
-#define WORDS_COLUMNS 86
+#define LEAST_CELLS 8
+// Columns of the words, at their longest; what is left goes to the bar. Narrower terminals get short
+// words and no id.
+#define SHORT_WORDS 69
+#define LONG_WORDS 86
 #define REDRAW_S 0.25
 #define PLAIN_LINE_S 5.0
 
@@ -47,11 +50,11 @@ void progress_duration(double seconds, char *out, size_t n) {
         snprintf(out, n, "%ld s", s);
 }
 
-static void bar(double fraction, char *out, size_t n) {
+static void bar(double fraction, int words, char *out, size_t n) {
     static const char *const eighths[] = {"", "▏", "▎", "▍", "▌", "▋", "▊", "▉"};
     const bool fine = terminal_utf8();
-    const int spare = terminal_columns() - WORDS_COLUMNS;
-    const int cells = spare < 8 ? 8 : spare > MOST_CELLS ? MOST_CELLS : spare;
+    const int spare = terminal_columns() - words;
+    const int cells = spare < LEAST_CELLS ? LEAST_CELLS : spare > MOST_CELLS ? MOST_CELLS : spare;
     const int filled = (int)(fraction * cells * 8);
     size_t used = 0;
     for (int i = 0; i < cells && used + 4 < n; i++) {
@@ -73,17 +76,21 @@ void progress_show(const cJSON *run) {
     const cJSON *fbar = cJSON_GetObjectItemCaseSensitive(run, "fbar");
     const char *id = cJSON_GetStringValue(cJSON_GetObjectItemCaseSensitive(run, "id"));
     const bool live = terminal_interactive();
+    const int words = LONG_WORDS + (int)(id ? strlen(id) : 3);
+    const bool is_short = live && terminal_columns() < words + LEAST_CELLS;
     if (live)
-        bar(fraction, cells, sizeof cells);
+        bar(fraction, is_short ? SHORT_WORDS : words, cells, sizeof cells);
     progress_duration(number(run, "eta_s"), eta, sizeof eta);
     if (strcmp(progress_state(run), "running") != 0)
         snprintf(state, sizeof state, "  %s", progress_state(run));
-    if (rate > 0) // last, since a narrow terminal cuts it off
-        snprintf(speed, sizeof speed, "  %.3g M particle-steps/s", rate * 1e-6);
-    snprintf(line, sizeof line, "%s %s%s%5.1f %%  step %.0f  t = %.4g s  ETA %s  F-bar %s%s%s",
-             id ? id : "run", cells, live ? " " : "", 100 * fraction, number(run, "step"),
-             number(run, "time"), progress_over(run) ? "-" : eta,
-             cJSON_IsTrue(fbar) || cJSON_IsObject(fbar) ? "on" : "off", state, speed);
+    if (rate > 0)
+        snprintf(speed, sizeof speed, is_short ? "  %.3g M/s" : "  %.3g M particle-steps/s",
+                 rate * 1e-6);
+    snprintf(line, sizeof line, "%s%s%s%s%5.1f %%  step %.0f  t = %.4g s%s  ETA %s  F-bar %s%s",
+             is_short ? "" : id ? id : "run", is_short ? "" : " ", cells, live ? " " : "",
+             100 * fraction, number(run, "step"), number(run, "time"), speed,
+             progress_over(run) ? "-" : eta,
+             cJSON_IsTrue(fbar) || cJSON_IsObject(fbar) ? "on" : "off", state);
     if (live)
         terminal_status(line);
     else if (strcmp(line, plain) != 0)

@@ -1,10 +1,13 @@
 """What fbar says: JSON where it is asked for, colours on terminals only, and what to do next."""
+import fcntl
 import json
 import os
 import pty
 import re
 import select
+import struct
 import subprocess
+import termios
 import time
 
 import pytest
@@ -60,9 +63,10 @@ def test_json_of_a_fault_says_what_is_wrong(fbar, fake):
     assert result.returncode == 4 and parsed(result)["faults"] == [result.stderr.removeprefix("fbar: ").strip()]
 
 
-def on_a_terminal(*words, **more):
+def on_a_terminal(*words, columns=80, **more):
     """What fbar writes to a terminal, standard output and error together."""
     leader, follower = pty.openpty()
+    fcntl.ioctl(follower, termios.TIOCSWINSZ, struct.pack("HHHH", 24, columns, 0, 0))
     process = subprocess.Popen([conftest.FBAR, *map(str, words)], stdout=follower, stderr=follower, stdin=follower,
                                env={**conftest.environment(), "TERM": "xterm", "LC_ALL": "C.UTF-8", **more})  # fmt: skip
     os.close(follower)
@@ -90,6 +94,24 @@ def test_colours_are_for_terminals(fbar, fake):
         assert not ESCAPE.search(on_a_terminal("--url", daemon.url, *words, NO_COLOR="1")), words
         assert not ESCAPE.search(on_a_terminal("--url", daemon.url, *words, TERM="dumb")), words
     assert not ESCAPE.search(on_a_terminal("--url", daemon.url, "--json", "list"))
+
+
+@pytest.mark.parametrize("columns", [80, 100, 200])
+def test_progress_line_has_everything_in_any_width(fake, columns):
+    daemon = fake(n_frames=3)
+    route, asked = daemon.route, []
+
+    def advance_when_asked(method, path, body, headers):
+        answer = route(method, path, body, headers)
+        if path == "/v1/runs/r1" and len(asked) < 3:
+            asked.append(path)
+            daemon.advance(live=False)
+        return answer
+    daemon.route = advance_when_asked
+    text = on_a_terminal("--url", daemon.url, "watch", "r1", columns=columns)
+    line = [ESCAPE.sub("", part) for part in re.split(r"\r(?:\x1b\[K)?", text) if "step" in part][0]
+    assert re.search(r"[█░▏▎▍▌▋▊▉]+ +\d+\.\d %  step \d+  t = \S+ s  1 M.*/s  ETA 1 s  F-bar on", line), line
+    assert len(line) < columns and ("r1" in line) == (columns > 96)
 
 
 def test_messages_say_what_to_do_next(fbar, fake, recording, tmp_path):
