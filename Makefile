@@ -57,7 +57,7 @@ MPM_SRC = $(filter-out $(LANES_SRC),$(sort $(wildcard server/mpm/*.c server/mpm/
 PROTO_SRC = $(sort $(wildcard proto/*.c))
 SERVER_SRC = $(sort $(wildcard server/*.c))
 CLIENT_SRC = $(sort $(wildcard client/*.c))
-SCENES = $(sort $(wildcard scenes/*.json))
+SCENES = $(sort $(wildcard scenes/*.json scenes/hard/*.json))
 TABLES = $(sort $(wildcard scenes/reference/*.csv))
 # The live page, and the library that draws its curves.
 CHARTJS ?= /usr/share/javascript/chart.js/chart.min.js
@@ -81,7 +81,7 @@ $(call levels,$(LANES_SRC)): ALL_CFLAGS += $(LANES_FLAGS)
 
 .PHONY: all programs deps deps-page deps-long deps-report libmpm demo report report-page report-docs check check-all check-layers check-unit \
 	check-physics check-api check-page \
-	check-cli check-loss check-asan check-clang check-fuzz check-tsan unit-programs check-long bench bench-solver bench-peer \
+	check-cli check-loss check-hard check-asan check-clang check-fuzz check-tsan unit-programs check-long bench bench-solver bench-peer \
 	bench-recording bench-status fuzz install uninstall format clean help
 .DELETE_ON_ERROR:
 .SECONDARY:
@@ -122,25 +122,26 @@ endef
 $(foreach level,$(LEVELS),$(eval $(call lanes_rule,$(level))))
 
 # The built-in scenes, the tables that they cite and the live page, embedded as they are: $(1) files, $(2) name of the list,
-# $(3) their ending.
+# $(3) what a name leaves away of its path, $(4) and of its end. A scene in a folder within is called FOLDER-NAME.
 embed = $(Q){ echo '\#include "server/scenes_data.h"'; i=0; \
 	for f in $(1); do echo "static const char text_$$i[] = {"; i=$$((i + 1)); \
 	od -An -v -tx1 $$f | sed "s/ \([0-9a-f][0-9a-f]\)/'\\\\x\1',/g"; echo "0};"; done; \
 	echo "const struct scenes_data $(2)[] = {"; i=0; \
-	for f in $(1); do echo "{\"$$(basename $$f $(3))\", text_$$i, sizeof text_$$i - 1},"; i=$$((i + 1)); done; \
+	for f in $(1); do n=$${f\#\#$(3)}; n=$$(echo $${n%$(4)} | tr / -); \
+	echo "{\"$$n\", text_$$i, sizeof text_$$i - 1},"; i=$$((i + 1)); done; \
 	echo "{0, 0, 0}};"; } > $@
 $(B)/gen/scenes_data.c: $(SCENES) Makefile
 	$(call say,EMBED,scenes)
 	@mkdir -p $(@D)
-	$(call embed,$(SCENES),scenes_data,.json)
+	$(call embed,$(SCENES),scenes_data,scenes/,.json)
 $(B)/gen/tables_data.c: $(TABLES) Makefile
 	$(call say,EMBED,tables)
 	@mkdir -p $(@D)
-	$(call embed,$(TABLES),tables_data,.csv)
+	$(call embed,$(TABLES),tables_data,*/,.csv)
 $(B)/gen/page_data.c: $(PAGE) Makefile
 	$(call say,EMBED,page)
 	@mkdir -p $(@D)
-	$(call embed,$(PAGE),page_data,)
+	$(call embed,$(PAGE),page_data,*/,)
 $(CHARTJS):
 	@echo "$@ is missing: make deps installs it (Debian's libjs-chart.js), or set CHARTJS"; exit 1
 GEN_OBJ = $(addprefix $(B)/obj/gen/,scenes_data.o tables_data.o page_data.o)
@@ -171,6 +172,11 @@ BENCH_OBJ = $(call obj,$(addprefix bench/,solver.c stages.c scenes.c)) $(BENCH_L
 $(B)/obj/bench/%.o: ALL_CFLAGS += $(call pc_cflags,$(SERVER_LIBS)) $(OPENMP) $(if $(LEVELS),-DMPM_HAS_LANES) -Wno-missing-prototypes
 $(BENCH_LANES): ALL_CFLAGS += $(LANES_FLAGS)
 $(B)/bench-solver: $(BENCH_OBJ) $(SERVER_OBJ) $(call obj,$(PROTO_SRC)) $(B)/libmpm.a
+	$(call say,LD,$@)
+	$(Q)$(CC) $(ALL_LDFLAGS) -pthread $(OPENMP) $^ $(call pc_libs,$(SERVER_LIBS)) -lm -o $@
+
+$(B)/obj/bench/runner.o: ALL_CFLAGS += $(call pc_cflags,libcjson)
+$(B)/runner: $(B)/obj/bench/runner.o $(SERVER_OBJ) $(call obj,$(PROTO_SRC)) $(B)/libmpm.a
 	$(call say,LD,$@)
 	$(Q)$(CC) $(ALL_LDFLAGS) -pthread $(OPENMP) $^ $(call pc_libs,$(SERVER_LIBS)) -lm -o $@
 
@@ -208,10 +214,10 @@ check: deps-page ## build and run all tests (installs what is missing)
 	@$(MAKE) --no-print-directory check-all
 
 # The test programs, built but not run: in parallel, where the tests themselves run one by one.
-programs: $(UNIT) $(PHYSICS) $(FUZZ) $(B)/tests/failing.so
+programs: $(UNIT) $(PHYSICS) $(FUZZ) $(B)/tests/failing.so $(B)/runner
 
 check-all: all
-	$(Q)$(MAKE) --no-print-directory check-layers check-unit check-physics check-api check-page check-cli check-loss
+	$(Q)$(MAKE) --no-print-directory check-layers check-unit check-physics check-hard check-api check-page check-cli check-loss
 	$(Q)$(MAKE) --no-print-directory check-asan
 
 check-layers: all
@@ -268,6 +274,11 @@ check-tsan: ## many clients, subscribers and patches under ThreadSanitizer
 	$(Q)$(MAKE) --no-print-directory -j$$(nproc) VARIANT=tsan build/tsan/fbard
 	$(Q)FBARD=$(CURDIR)/build/tsan/fbard FBAR=$(CURDIR)/$(B)/fbar $(PYTEST) tests/api/test_threads.py tests/api/test_concurrency.py \
 	  tests/api/test_watching.py tests/api/test_connections.py tests/api/test_model.py
+
+# The table of hard cases; `make check-long` has all of it and the ladder of time increments.
+check-hard: $(B)/runner ## the hard cases: a verdict each (bench/hard.py), none worse than recorded
+	$(Q)RUNNER=$(CURDIR)/$(B)/runner $(PYTHON) bench/hard.py $(if $(FBARD_LONG),,--quick) -o build/hard > build/hard.txt || { cat build/hard.txt; exit 1; }
+	$(if $(FBARD_LONG),$(Q)RUNNER=$(CURDIR)/$(B)/runner $(PYTHON) bench/ladder.py -o build/hard)
 
 check-fuzz: $(FUZZ) ## the fuzzers' corpus once more, without fuzzing
 	$(Q)set -e; for t in $^; do $$t tests/fuzz/corpus/$${t##*fuzz_}/*; done

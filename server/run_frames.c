@@ -49,8 +49,33 @@ void run_begin_epoch(struct run *r, const char *what) {
              (unsigned long long)r->now.epoch, (unsigned long long)r->next_seq, what);
 }
 
+// Algorithm 1's creep and volumes that drift apart show in the drift alone. Looked at with the samples, so
+// that it is told at the same steps however often somebody asks; once, and again after a change of the
+// configuration. Levels: `make report`, creep.csv: Cook's membrane is 5 % off once zhao's drift is 0.0045 to
+// 0.006, whatever basis and increment; the anchored scheme reaches 0.02 in impacts that it gets right.
+#define WARNING_DRIFT "F-bar: the volumes that forces and stresses use have drifted apart"
+#define DRIFT_ZHAO 0.005
+#define DRIFT_ANCHORED 0.05
+static void watch_drift(struct run *r) {
+    const enum mpm_fbar_scheme scheme = mpm_settings_now(r->sim).fbar.scheme;
+    if (scheme == MPM_FBAR_OFF)
+        return;
+    for (unsigned k = 0; k < r->now.n_warnings; k++)
+        if (strncmp(r->now.warnings[k], WARNING_DRIFT, strlen(WARNING_DRIFT)) == 0)
+            return;
+    const double drift = mpm_drift(r->sim);
+    const double level = scheme == MPM_FBAR_ZHAO ? DRIFT_ZHAO : DRIFT_ANCHORED;
+    if (drift > level)
+        run_warn(&r->now,
+                 WARNING_DRIFT ", by %.3g at t = %.6g s (above %g displacements may be off by 5 %% "
+                               "and more)%s",
+                 drift, mpm_time(r->sim) + 0.0, level,
+                 scheme == MPM_FBAR_ZHAO ? ": under loads that last, use the scheme anchored" : "");
+}
+
 void run_sample(struct run *r) {
     double t = run_clock();
+    watch_drift(r);
     for (size_t k = 0; k < series_n_probes(r->series); k++)
         mpm_probe_value(r->sim, k, r->row + series_probe(r->series, k)->column);
     for (size_t k = 0; k < series_n_columns(r->series); k++)

@@ -12,10 +12,6 @@
 #define ETA_SECONDS 1.0         // between two samples of the speed; the ring holds 16
 #define RATIO_COMPRESSIBLE 0.45 // Poisson's ratio below which F-bar has nothing to cure
 #define RATIO_DT_CLOSE 0.9      // of the stability limit
-// |ln(J/Jbar)| from which Algorithm 1's creep is worth a word: the volume that forces use is then
-// 10 % off the one that the pressure uses (Cook's membrane, h = 1: 5 % after 40 s).
-#define DRIFT_LARGE 0.1
-#define WARNING_DRIFT "the volume has drifted from that of the stress"
 
 // ---- Clocks -----------------------------------------------------------------------------------
 
@@ -66,6 +62,9 @@ void run_warn_scene(struct run_status *now, const struct mpm_def *def) {
                          "excepts it",
                          material->name, material->parameters[p]);
     }
+    if (def->basis == MPM_LINEAR)
+        run_warn(now, "the linear basis is for comparison only: a particle that barely reaches a "
+                      "node throws it away, whatever the time increment");
     if (now->dt_limit > 0 && now->dt > now->dt_limit)
         run_warn(now, "dt = %g s is above the stability limit %g s", now->dt, now->dt_limit);
     else if (now->dt_limit > 0 && now->dt > RATIO_DT_CLOSE * now->dt_limit)
@@ -105,17 +104,6 @@ static void eta_update(struct run *r) {
     r->now.eta_s = running && done > 0 ? (r->now.end_time - r->now.time) * span / done : NAN;
 }
 
-// Algorithm 1 creeps under a static load (docs/method.md, section 3), which nothing else shows.
-static void warn_of_drift(struct run *r) {
-    const double drift = r->now.fbar_scheme == MPM_FBAR_ZHAO ? mpm_drift(r->sim) : 0;
-    run_unwarn(&r->now, WARNING_DRIFT);
-    if (drift > DRIFT_LARGE)
-        run_warn(&r->now,
-                 WARNING_DRIFT " by up to |ln(J/Jbar)| = %.2g: F-bar's Algorithm 1 creeps under a "
-                               "lasting load; {\"scheme\": \"anchored\"} does not",
-                 drift);
-}
-
 static void eta_restart(struct run *r) {
     r->n_eta = 0;
 }
@@ -145,7 +133,6 @@ void run_status_fill(struct run *r, bool exact) {
             r->now.balance_step = r->now.step;
             r->now.dt = mpm_next_dt(r->sim);
             r->now.dt_limit = mpm_dt_limit(r->sim);
-            warn_of_drift(r);
             r->last_balance = run_clock();
             r->balance_cost = r->last_balance - t;
         }

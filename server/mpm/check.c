@@ -5,6 +5,7 @@
 #include "server/mpm/check_inside.h"
 #include "server/mpm/seed.h"
 #include "server/mpm/sim.h"
+#include "server/mpm/stability.h"
 
 #define MAX_PER_DIRECTION 32 // particles per cell and direction: beyond it a smaller cell is meant
 #define MAX_PARTICLES 2000000000.0 // ids are 32 bits
@@ -52,7 +53,7 @@ double mpm_def_dt_limit(const struct mpm_def *def, size_t stage) {
         c = fmax(c, m->model->wave_speed(m->parameters));
         nu = fmax(nu, m->model->diffusivity ? m->model->diffusivity(m->parameters) : 0);
     }
-    return mpm_dt_limit_at(def->cell, c, largest_speed(def), nu, def->dimension);
+    return mpm_stability_limit(mpm_stability_of(def), def->cell, c + largest_speed(def), nu);
 }
 
 static enum mpm_status range_fault(struct mpm_error *err, const char *pointer, const char *key,
@@ -62,7 +63,8 @@ static enum mpm_status range_fault(struct mpm_error *err, const char *pointer, c
 }
 
 enum mpm_status mpm_check_settings(const struct mpm_settings *s, const char *pointer, int dim,
-                                   double dt_limit, bool unstable_ok, struct mpm_error *err) {
+                                   double dt_limit, double cfl_limit, bool unstable_ok,
+                                   struct mpm_error *err) {
     if ((int)s->fbar.scheme < 0 || s->fbar.scheme >= MPM_N_FBAR_SCHEMES) {
         return range_fault(err, pointer, "/fbar/scheme", "a known scheme", (double)s->fbar.scheme);
     }
@@ -104,12 +106,12 @@ enum mpm_status mpm_check_settings(const struct mpm_settings *s, const char *poi
     if (s->dt == 0 && !(s->cfl > 0 && is_finite(s->cfl))) {
         return range_fault(err, pointer, "/time/cfl", "above 0", s->cfl);
     }
-    if (s->dt == 0 && s->cfl > 0.5 && !unstable_ok) {
-        return mpm_fail_value(err, MPM_ERR_UNSTABLE_DT, TEXT("%s/time/cfl", pointer), "at most 0.5",
-                              TEXT("%.9g", s->cfl),
-                              "a CFL number of %.6g is above the stability limit of 0.5; or set "
-                              "\"unstable_ok\": true",
-                              s->cfl);
+    if (s->dt == 0 && s->cfl > cfl_limit && !unstable_ok) {
+        return mpm_fail_value(err, MPM_ERR_UNSTABLE_DT, TEXT("%s/time/cfl", pointer),
+                              TEXT("at most %.6g", cfl_limit), TEXT("%.9g", s->cfl),
+                              "a CFL number of %.6g is above the stability limit of %.6g for this "
+                              "basis and particles_per_cell; or set \"unstable_ok\": true",
+                              s->cfl, cfl_limit);
     }
     return MPM_OK;
 }
@@ -676,7 +678,7 @@ static void check_stages(struct report *r, const struct mpm_def *def) {
         const struct mpm_settings defaults = mpm_settings_default(),
                                   now = mpm_stage_settings(def, k, &defaults);
         struct mpm_error fault;
-        if (mpm_check_settings(&now, TEXT("/stages/%zu", k), def->dimension, INFINITY, true,
+        if (mpm_check_settings(&now, TEXT("/stages/%zu", k), def->dimension, INFINITY, INFINITY, true,
                                &fault)) {
             add(r, &fault);
         }
@@ -699,7 +701,7 @@ static void check_times(struct report *r, const struct mpm_def *def) {
             continue; // said already
         }
         if (mpm_check_settings(&now, pointer, def->dimension, mpm_def_dt_limit(def, k),
-                               def->unstable_ok, &fault)) {
+                               mpm_stability_of(def).wave, def->unstable_ok, &fault)) {
             add(r, &fault);
         }
     }
@@ -718,7 +720,7 @@ size_t mpm_check(const struct mpm_def *def,
     for (size_t k = 0; k < def->n_materials; k++) {
         check_material(&r, &def->materials[k], "");
     }
-    if (mpm_check_settings(&def->settings, "", def->dimension, INFINITY, true, &fault)) {
+    if (mpm_check_settings(&def->settings, "", def->dimension, INFINITY, INFINITY, true, &fault)) {
         add(&r, &fault);
     }
     for (size_t k = 0; k < def->n_walls; k++) {

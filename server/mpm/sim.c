@@ -8,9 +8,7 @@
 #include "server/mpm/basis.h"
 #include "server/mpm/laws.h"
 #include "server/mpm/seed.h"
-
-#define STABLE_CFL                                                                                 \
-    0.5 // dt <= 0.5 h/c is stable for every basis, with F-bar and without (docs/method.md)
+#include "server/mpm/stability.h"
 
 struct mpm_settings mpm_settings_default(void) {
     return (struct mpm_settings){
@@ -51,12 +49,6 @@ static double diffusivity(const struct mpm_sim *sim) {
     return largest;
 }
 
-// Explicit waves need dt <= STABLE_CFL h/c, explicit diffusion dt <= h^2/(2 dim nu); together the
-// rates add, and the same safety is kept for both.
-double mpm_dt_limit_at(double h, double wave_speed, double v_max, double nu, int dim) {
-    return STABLE_CFL / ((wave_speed + v_max) / h + 2 * dim * nu / (h * h));
-}
-
 double mpm_largest_speed(const struct mpm_sim *sim) {
     double largest = sqrt(sim->c.v2_max);
     for (size_t k = 0; k < sim->n_rigids; k++) {
@@ -68,13 +60,13 @@ double mpm_largest_speed(const struct mpm_sim *sim) {
 }
 
 double mpm_dt_limit(const struct mpm_sim *sim) {
-    return mpm_dt_limit_at(sim->grid.h, mpm_wave_speed(sim), mpm_largest_speed(sim),
-                           diffusivity(sim), sim->grid.dim);
+    return mpm_stability_limit(mpm_stability_of(sim->def), sim->grid.h,
+                               mpm_wave_speed(sim) + mpm_largest_speed(sim), diffusivity(sim));
 }
 
 double mpm_next_dt(const struct mpm_sim *sim) {
     const struct mpm_clockwork *c = &sim->c;
-    const double dt = c->now.dt > 0 ? c->now.dt : c->now.cfl / STABLE_CFL * mpm_dt_limit(sim);
+    const double dt = c->now.dt > 0 ? c->now.dt : c->now.cfl / mpm_stability_of(sim->def).wave * mpm_dt_limit(sim);
     const double left = c->stage_end - c->time;
     // Fit the last step to the end, but leave a whole step whole whatever round-off says.
     return left > 0 && left < dt * (1 - 1e-6) ? left : dt;
@@ -345,10 +337,12 @@ static bool create_sets(struct mpm_sim *sim) {
     return true;
 }
 
+#define ON_THE_WALL 1e-6 // cells: the round-off of 1e9 steps that each move it by 1e-15 of a cell
+
 // Where a particle counts as having left the domain. uGIMP and linear walls hold nodes, not
 // particles: a particle pressed against one may sink past it by a fraction of its own size (2 % of
 // a cell was seen in the dam break), so where such a wall stands on the domain's edge, half a
-// particle more is allowed.
+// particle more is allowed. One that begins on a B-spline's wall stays there but for round-off.
 static void set_exit(struct mpm_sim *sim) {
     const struct mpm_def *def = sim->def;
     double half = 0;
@@ -361,14 +355,12 @@ static void set_exit(struct mpm_sim *sim) {
     }
     for (size_t k = 0; k < sim->n_walls; k++) {
         const struct mpm_wall_def *w = &sim->walls[k].def;
-        if (sim->walls[k].folds) {
-            continue;
+        const double beyond = sim->walls[k].folds ? ON_THE_WALL * def->cell : half;
+        if (w->keeps_above && w->at - beyond < sim->exit_min[w->axis]) {
+            sim->exit_min[w->axis] = w->at - beyond;
         }
-        if (w->keeps_above && w->at - half < sim->exit_min[w->axis]) {
-            sim->exit_min[w->axis] = w->at - half;
-        }
-        if (!w->keeps_above && w->at + half > sim->exit_max[w->axis]) {
-            sim->exit_max[w->axis] = w->at + half;
+        if (!w->keeps_above && w->at + beyond > sim->exit_max[w->axis]) {
+            sim->exit_max[w->axis] = w->at + beyond;
         }
     }
 }
@@ -608,7 +600,7 @@ void mpm_estimate(const struct mpm_def *def, struct mpm_estimate *out) {
     for (size_t k = 0; k < def->n_stages; k++) {
         const struct mpm_settings now = mpm_stage_settings(def, k, &def->settings);
         out->dt_limit = mpm_def_dt_limit(def, k);
-        out->dt = now.dt > 0 ? now.dt : now.cfl / STABLE_CFL * out->dt_limit;
+        out->dt = now.dt > 0 ? now.dt : now.cfl / mpm_stability_of(def).wave * out->dt_limit;
         steps += ceil(def->stages[k].duration / out->dt * (1 - 1e-9));
     }
     out->steps = (uint64_t)fmin(steps, 9e18); // what is beyond has no whole number
@@ -675,7 +667,8 @@ enum mpm_status mpm_change(struct mpm_sim *sim, const struct mpm_settings *setti
     struct mpm_settings now = sim->c.now;
     overlay(&now, settings, which);
     const enum mpm_status status = mpm_check_settings(
-        &now, "", sim->def->dimension, mpm_dt_limit(sim), sim->def->unstable_ok, err);
+        &now, "", sim->def->dimension, mpm_dt_limit(sim), mpm_stability_of(sim->def).wave,
+        sim->def->unstable_ok, err);
     if (status) {
         return status;
     }

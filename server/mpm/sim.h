@@ -81,17 +81,16 @@ struct mpm_settings mpm_stage_settings(const struct mpm_def *def, size_t stage,
                                        const struct mpm_settings *base);
 // Gravity in force at time t of the present stage, m/s^2.
 void mpm_gravity_at(const struct mpm_sim *sim, double t, double *g);
-// Fastest P-wave of the present materials, m/s; and the limit on dt that it sets with particles
-// moving at v_max (m/s).
+// Fastest P-wave of the present materials, m/s.
 double mpm_wave_speed(const struct mpm_sim *sim);
 double mpm_largest_speed(const struct mpm_sim *sim); // of particles and rigid bodies, m/s
-double mpm_dt_limit_at(double cell, double wave_speed, double v_max, double diffusivity, int dim);
-// The same for a stage of a definition, with the bodies' initial speeds.
+// The stability limit for a stage of a definition, with the bodies' initial speeds, s.
 double mpm_def_dt_limit(const struct mpm_def *def, size_t stage);
-// Whether settings are in their bounds; `pointer` is the place of the settings, dt_limit in s.
+// Whether settings are in their bounds; `pointer` is the place of the settings, dt_limit in s, and cfl_limit
+// that of a CFL number.
 enum mpm_status mpm_check_settings(const struct mpm_settings *settings, const char *pointer,
-                                   int dim, double dt_limit, bool unstable_ok,
-                                   struct mpm_error *err);
+                                   int dim, double dt_limit, double cfl_limit,
+                                   bool unstable_ok, struct mpm_error *err);
 // Applies what stage `stage` states, removes and resets, and sets the clock to its start.
 void mpm_enter_stage(struct mpm_sim *sim, size_t stage);
 double mpm_kinetic_energy(const struct mpm_sim *sim);

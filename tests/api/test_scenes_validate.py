@@ -6,7 +6,9 @@ import pytest
 from boxes import WATER_PARTICLES, endless, merged, water
 from fbard import ROOT, Daemon
 
-BUILTIN = sorted(p.stem for p in (ROOT / "scenes").glob("*.json"))
+FILES = {p.stem: p for p in (ROOT / "scenes").glob("*.json")}
+FILES |= {f"hard-{p.stem}": p for p in (ROOT / "scenes" / "hard").glob("*.json")}
+BUILTIN = sorted(FILES)
 
 
 def estimate(answer):
@@ -41,7 +43,7 @@ def test_materials_list_their_parameters(daemon):
 @pytest.mark.parametrize("scene", BUILTIN)
 def test_builtin_is_the_bare_file_and_valid(daemon, scene):
     bare = daemon.get(f"/v1/scenes/{scene}")
-    assert bare == json.loads((ROOT / "scenes" / f"{scene}.json").read_text())
+    assert bare == json.loads(FILES[scene].read_text())
     estimate(validate(daemon, bare).json)
 
 

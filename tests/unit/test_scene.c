@@ -420,7 +420,7 @@ static void test_scene_passes_on_faults_of_the_solver(void **state) {
     assert_fault("{\"bodies\":{\"ball\":{\"shape\":{\"disk\":{\"center\":[2,9]}}}}}",
                  "/bodies/ball/shape", "range");
     assert_fault("{\"cell\":1e-6}", "/cell", "range");
-    assert_fault("{\"cell\":1e-3,\"bodies\":{\"pool\":{\"particles_per_cell\":1024}}}",
+    assert_fault("{\"cell\":1e-3,\"time\":{\"dt\":1e-7},\"bodies\":{\"pool\":{\"particles_per_cell\":1024}}}",
                  "/bodies/pool/shape", "memory");
     scene_free(create("{\"time\":{\"dt\":1},\"unstable_ok\":true}"));
     scene_free(create("{\"time\":{\"dt\":1,\"unstable_ok\":true}}"));
