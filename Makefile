@@ -364,9 +364,10 @@ INSTALLED = $(addprefix $(I)/,fbar.1 fbard.8 fbar.bash fbar.zsh mpm.h libmpm.pc 
 
 install: all $(INSTALLED) $(B)/libmpm.a ## into PREFIX (default /usr/local), under DESTDIR
 	$(INSTALL) -d $(addprefix $(DESTDIR),$(PREFIX)/bin $(PREFIX)/include/libmpm $(PREFIX)/lib/pkgconfig $(UNITDIR) \
-	  $(PREFIX)/share/fbard/scenes/reference $(PREFIX)/share/man/man1 $(PREFIX)/share/man/man8 $(BASHDIR) $(ZSHDIR))
+	  $(PREFIX)/share/fbard/scenes/reference $(PREFIX)/share/fbard/scenes/hard $(PREFIX)/share/man/man1 $(PREFIX)/share/man/man8 $(BASHDIR) $(ZSHDIR))
 	$(INSTALL) $(B)/fbard $(B)/fbar $(DESTDIR)$(PREFIX)/bin
-	$(INSTALL) -m 644 $(SCENES) scenes/README.md $(DESTDIR)$(PREFIX)/share/fbard/scenes
+	$(INSTALL) -m 644 $(filter-out scenes/hard/%,$(SCENES)) scenes/README.md $(DESTDIR)$(PREFIX)/share/fbard/scenes
+	$(INSTALL) -m 644 $(filter scenes/hard/%,$(SCENES)) $(DESTDIR)$(PREFIX)/share/fbard/scenes/hard
 	$(INSTALL) -m 644 $(TABLES) $(DESTDIR)$(PREFIX)/share/fbard/scenes/reference
 	$(INSTALL) -m 644 $(I)/fbar.1 $(DESTDIR)$(PREFIX)/share/man/man1
 	$(INSTALL) -m 644 $(I)/fbard.8 $(DESTDIR)$(PREFIX)/share/man/man8

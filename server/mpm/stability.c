@@ -24,7 +24,7 @@ static struct mpm_stability factors(enum mpm_basis basis, int dim, int n) {
                       : (struct mpm_stability){.wave = dim == 2 ? 0.6 : 0.55, .viscous = 0.17};
     case MPM_BSPLINE3:
         return n == 1 ? (struct mpm_stability){.wave = 0.65, .viscous = 0.2}
-                      : (struct mpm_stability){.wave = dim == 2 ? 0.75 : 0.7, .viscous = 0.25};
+                      : (struct mpm_stability){.wave = dim == 2 ? 0.75 : 0.7, .viscous = 0.27};
     case MPM_GIMP:
     case MPM_N_BASES:
         break;
