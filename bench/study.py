@@ -47,6 +47,13 @@ def merged(target, patch):
     return result
 
 
+def composed(first, second):
+    """One merge patch that does what `first` and then `second` do to objects: members that are null stay."""
+    if not isinstance(second, dict) or not isinstance(first, dict):
+        return second
+    return {**first, **{k: composed(first.get(k), v) for k, v in second.items()}}
+
+
 def scene_path(name):
     plain = ROOT / "scenes" / f"{name}.json"
     return plain if plain.exists() else ROOT / "scenes" / "hard" / f"{name.removeprefix('hard-')}.json"
