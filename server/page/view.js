@@ -194,7 +194,7 @@ export class View {
   }
 
   setUp() {
-    const gl = this.canvas.getContext("webgl2", { antialias: true, alpha: false });
+    const gl = this.canvas.getContext("webgl2", { antialias: false, alpha: false });
     this.gl = gl;
     if (gl === null) return;
     this.points = program(gl, VERTEX, FRAGMENT);
