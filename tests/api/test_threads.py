@@ -6,7 +6,7 @@ import time
 
 import zmq
 from boxes import endless, water
-from fbard import until
+from fbard import PATIENCE, until
 from frames import Frame
 from test_watching import Stream
 
@@ -20,7 +20,8 @@ def zeromq(daemon, end):
         s = context.socket(zmq.SUB)
         s.subscribe(b"run/")
         s.connect(daemon.publish)
-        while time.monotonic() < end:
+        # At least one, however slow a sanitizer and a busy machine make it.
+        while time.monotonic() < end or (count == 0 and time.monotonic() < end + PATIENCE):
             if s.poll(100):
                 topic, block = s.recv_multipart()
                 count += topic.endswith(b"/frame") and Frame(block).header["seq"] >= 0
@@ -41,7 +42,7 @@ def streamed(daemon, run, kind, end):
 
 def client(daemon, runs, seed, end):
     random_, asked = random.Random(seed), 0
-    while time.monotonic() < end:
+    while time.monotonic() < end or asked < 5:
         run, what = random_.choice(runs), random_.randrange(12)
         if what < 3:
             reply = daemon.request("GET", f"/v1/runs/{run}" + random_.choice(["", "/config", "/probes", "/frames/latest"]))
@@ -76,12 +77,12 @@ def test_many_clients_subscribers_and_patches_at_once(fresh):
         listeners = [pool.submit(zeromq, d, end) for _ in range(4)]
         listeners += [pool.submit(streamed, d, runs[0], kind, end) for kind in ("events", "stream") * 2]
         clients = [pool.submit(client, d, runs, seed, end) for seed in range(16)]
-        time.sleep(max(0.0, end - time.monotonic()))
-        for run in runs:
-            until(lambda: d.request("POST", f"/v1/runs/{run}:resume").status == 200)
         asked = sum(c.result() for c in clients)
+        for run in runs:  # whatever they were left in: so that each listener gets something
+            until(lambda: d.request("POST", f"/v1/runs/{run}:resume").status == 200)
+        heard = [listener.result() for listener in listeners]
         for run in runs:
             d.request("POST", f"/v1/runs/{run}:cancel")
-        assert all(listener.result() > 0 for listener in listeners)
+        assert all(heard), heard
     assert asked > 16
     d.stop()  # and looks for what a sanitizer wrote
