@@ -79,7 +79,7 @@ $(B)/obj/server/mpm/kernels.o: ALL_CFLAGS += $(if $(LEVELS),-DMPM_HAS_LANES)
 LANES_FLAGS = $(if $(filter asan tsan debug coverage,$(VARIANT)),-O1,-O2) -fno-tree-vectorize -fno-tree-slp-vectorize
 $(call levels,$(LANES_SRC)): ALL_CFLAGS += $(LANES_FLAGS)
 
-.PHONY: all programs deps deps-page deps-long deps-report libmpm demo report report-page report-docs check check-all check-layers check-unit \
+.PHONY: studies all programs deps deps-page deps-long deps-report libmpm demo report report-page report-docs check check-all check-layers check-unit \
 	check-physics check-api check-page \
 	check-cli check-loss check-hard check-asan check-clang check-fuzz check-tsan unit-programs check-long bench bench-solver bench-peer \
 	bench-recording bench-status fuzz install uninstall format clean help
@@ -327,8 +327,17 @@ demo: deps ## the paper's dam break, F-bar on and off: pictures in build/demo (u
 # SIZE=small takes minutes, SIZE=paper hours; both go on where they were stopped or killed (bench/report/README.md).
 SIZE ?= small
 report: deps-report ## the paper's figures with our numbers: build/report/SIZE/report.html (SIZE=small, minutes; SIZE=paper, hours)
-	@$(MAKE) --no-print-directory all
+	@$(MAKE) --no-print-directory all $(B)/runner
+	@$(MAKE) --no-print-directory studies
 	@$(PYTHON) bench/report $(SIZE) $(REPORT)
+
+# Many small runs; each keeps what it has done in build/report/SIZE/points.jsonl and goes on there.
+STUDY = RUNNER=$(CURDIR)/$(B)/runner $(PYTHON)
+QUICK = $(if $(filter paper,$(SIZE)),,--quick)
+studies: $(B)/runner
+	@mkdir -p build/report/$(SIZE)
+	@for study in "accuracy.py $(SIZE)" "creep.py $(QUICK)" "schemes.py" "hard.py" "ladder.py $(QUICK)"; do echo "bench/$$study"; \
+	  $(STUDY) bench/$$study -o build/report/$(SIZE) > build/report/$(SIZE)/study.txt || echo "bench/$$study: exit code $$?, see build/report/$(SIZE)/study.txt"; done
 
 report-page: deps-report ## the same page of what was run so far; runs nothing
 	@$(PYTHON) bench/report $(SIZE) --page

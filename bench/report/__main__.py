@@ -17,13 +17,15 @@ import cases  # noqa: E402
 import cook  # noqa: E402
 import dam_break  # noqa: E402
 import footing  # noqa: E402
+import hard_cases  # noqa: E402
 import landslide  # noqa: E402
 import page  # noqa: E402
 import recordings  # noqa: E402
 import runs  # noqa: E402
+import work_precision  # noqa: E402
 
 # A part is a module with TITLE, cases(size) and sections(shelf); README.md here says how to add one.
-PARTS = (cook, footing, dam_break, landslide)
+PARTS = (cook, footing, dam_break, landslide, work_precision, hard_cases)
 
 
 def draw(size, folder, docs):
