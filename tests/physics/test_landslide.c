@@ -56,7 +56,7 @@ static void test_landslide_runs_out_with_fbar(void **state) {
     }
 }
 
-// Without it the slope stands with both bases to 2.5 s (-0.44 m uGIMP, -0.42 m B-spline at 2 s); a
+// Without it the slope stands with both bases: -0.44 m (uGIMP) and -0.42 m (B-spline) at 2.6 s; a
 // prototype's B-splines started late, and were at 1.5 m.
 static void test_landslide_locks_without_fbar(void **state) {
     (void)state;
