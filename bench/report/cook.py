@@ -308,7 +308,7 @@ def figure_6(shelf):
     else:
         verdict = ("does not hold" if abs(z[7] - z[5]) > 0.05 else "holds",
                    f"<b>Algorithm 1 has no static solution: it creeps.</b> With zhao (uGIMP, h = {coarse:g} m) the loaded column is "
-                   f"{percent(z[5])} of FEM at {T_FIELD:g} s, as the paper shows it, and {percent(z[7])} at {z[6]:g} s: close to the "
+                   f"{percent(z[5])} of FEM at {T_FIELD:g} s, near it as in the paper, and {percent(z[7])} at {z[6]:g} s: close to the "
                    f"reference only at the time one looks. anchored is {percent(a[5])} and {percent(a[7])}. The standard "
                    f"uGIMP is too stiff ({percent(s[5])}), as the paper says; <b>but the standard quadratic B-spline is not</b> "
                    f"({percent(b[5])}): displacement hides its locking.")  # fmt: skip

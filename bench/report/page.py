@@ -116,9 +116,10 @@ def commit():
 
 
 def write_docs(parts, shelf, folder, size, docs):
-    """Writes docs/report.md, and copies the pictures into docs/report. Of what write() has drawn."""
-    kept = docs / "report"
-    kept.mkdir(exist_ok=True)
+    """Writes docs/report.md (of the size paper; report-SIZE.md of another), and copies the pictures into docs/report/SIZE.
+    Of what write() has drawn."""
+    kept = docs / "report" / size
+    kept.mkdir(parents=True, exist_ok=True)
     for old in kept.glob("*.png"):
         old.unlink()
     there = [r for r in (shelf.get(c.name) for c in shelf.cases) if r]
@@ -126,7 +127,8 @@ def write_docs(parts, shelf, folder, size, docs):
            f"Written by `make report-docs SIZE={size}` from what `make report SIZE={size}` has run: "
            f"{len(there)} of {len(shelf.cases)} runs. `make report` writes the whole page, with every table "
            "(`build/report/SIZE/report.html`). *standard* is without F\u0304, *zhao* is Algorithm 1 of the paper, *anchored* is our "
-           "scheme (method.md). Figures are of Zhao, Jiang and Choo; theirs are not copied here.", "",
+           "scheme (method.md). " + ("What is not run yet at full size is shown by the [small size](report-small.md). " if size == "paper" else
+                                     "The paper's sizes are in [report.md](report.md). ") + "Figures are of Zhao, Jiang and Choo; theirs are not copied here.", "",
            "| figure | verdict |", "|---|---|"]  # fmt: skip
     out += [f"| [{s.title}](#{s.anchor}) | {s.verdict[0]} |" for _, sections in parts for s in sections]
     for title, sections in parts:
@@ -136,12 +138,13 @@ def write_docs(parts, shelf, folder, size, docs):
             for picture in s.pictures:
                 if (folder / picture.file).exists():
                     (kept / picture.file).write_bytes((folder / picture.file).read_bytes())
-                    out += [f"![{picture.caption}](report/{picture.file})", "", f"*{picture.caption}*", ""]
+                    out += [f"![{picture.caption}](report/{size}/{picture.file})", "", f"*{picture.caption}*", ""]
             out += [f"The paper: {s.paper}", "", f"Measured: {s.measured}", "", f"Against: {s.reference}", "",
                     f"**Verdict: {s.verdict[0]}.** {s.verdict[1]}"]  # fmt: skip
             out += ["", f"Not run yet: {', '.join(s.missing)}."] if s.missing else []
-    (docs / "report.md").write_text("\n".join(out) + "\n", encoding="utf-8")
-    return docs / "report.md"
+    path = docs / ("report.md" if size == "paper" else f"report-{size}.md")
+    path.write_text("\n".join(out) + "\n", encoding="utf-8")
+    return path
 
 
 def write(parts, shelf, folder, size):
