@@ -96,7 +96,7 @@ def sections(shelf):
             "work-precision", "Work and precision", "nothing of the kind",
             "Problems with a known answer at several resolutions, with every basis and scheme, and from the default (quadratic "
             "B-splines, anchored, CFL 0.3) one factor at a time; <code>bench/accuracy.py --case NAME</code> runs a point again.",
-            "finite elements, exact and manufactured solutions", ("holds", f"{len(accuracy)} errors of {len({r["name"] for r in accuracy})} runs; the table has the settings that nothing beats"),
+            "finite elements, exact and manufactured solutions", ("holds", f"{len(accuracy)} errors of {len({r['name'] for r in accuracy})} runs; the table has the settings that nothing beats"),
             [Picture(f"work-{p}.png", f"{p}: error against cost", diagrams(accuracy, p)) for p in sorted({r["problem"] for r in accuracy})],
             [table("pareto-shown.csv", best, "Settings that nothing beats in both error and cost")]))  # fmt: skip
     series = rows_of(shelf, "creep.csv")
