@@ -314,8 +314,9 @@ function walls(pane) {
   const d = scene.dimension;
   const domain = scene.domain ?? { min: pane.seen[0], max: pane.seen[1] };
   const size = Math.max(...pane.seen[1].map((v, k) => v - pane.seen[0][k]));
-  const low = [0, 1, 2].map((k) => (k < d ? Math.max(domain.min[k], pane.seen[0][k] - 2 * size) : 0));
-  const high = [0, 1, 2].map((k) => (k < d ? Math.min(domain.max[k], pane.seen[1][k] + 2 * size) : 0));
+  const margin = (d === 2 ? 2 : 0.1) * size; // in 3D lines from afar would cross the view
+  const low = [0, 1, 2].map((k) => (k < d ? Math.max(domain.min[k], pane.seen[0][k] - margin) : 0));
+  const high = [0, 1, 2].map((k) => (k < d ? Math.min(domain.max[k], pane.seen[1][k] + margin) : 0));
   const gone = removed(scene, pane.frame.header.time);
   for (const [name, wall] of Object.entries(scene.walls ?? {})) {
     if (gone.includes(name)) continue;
@@ -391,7 +392,7 @@ function rangeOf(arrays) {
     range = [-most, most];
   }
   if (range[0] === range[1]) {
-    const more = Math.max(1e-12, 1e-3 * Math.abs(range[0]));
+    const more = range[0] !== 0 ? 1e-3 * Math.abs(range[0]) : 1;
     range = [range[0] - more, range[1] + more];
   }
   return range;

@@ -114,7 +114,7 @@ export class Camera {
         wide = Math.max(wide, Math.abs(corner.reduce((s, c, d) => s + c * x[d], 0)));
         tall = Math.max(tall, Math.abs(corner.reduce((s, c, d) => s + c * y[d], 0)));
       }
-      this.half = 1.25 * Math.max(tall, wide / aspect, 1e-9);
+      this.half = 1.5 * Math.max(tall, wide / aspect, 1e-9);
     }
     this.changed();
   }

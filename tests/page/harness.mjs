@@ -12,7 +12,7 @@ const root = path.resolve(import.meta.dirname ?? path.dirname(new URL(import.met
 const modules = process.env.PAGE_MODULES ?? path.join(root, "build/page");
 const { chromium } = createRequire(path.join(modules, "package.json"))("playwright-core");
 
-export const PATIENCE_MS = 1000 * Number(process.env.PATIENCE ?? 60); // a busy machine is allowed for; nothing waits that long unless it fails
+export const PATIENCE_MS = 1000 * Number(process.env.PATIENCE ?? 120); // a busy machine is allowed for; nothing waits that long unless it fails
 
 export async function until(what, condition) {
   const end = Date.now() + PATIENCE_MS;
