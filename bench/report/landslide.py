@@ -95,7 +95,7 @@ def pictures(shelf, field, stem, unit, limits, title, **options):
     for kind in [k for k in KINDS if k in whole]:
         run = whole[kind]
         made.append(snapshots(whole, [kind], field, f"{stem}-3d-{kind[0]}-{kind[1]}.png",
-                              f"{title}, 3D, {run.particles:,} particles: {BASES[kind[0]]}, {kind[1]}"
+                              f"{title}, 3D, {run.particles:,} particles, seen from the front and above (axes of the near face): {BASES[kind[0]]}, {kind[1]}"
                               + ("" if run.complete else f" (under way, t = {run.times[-1]:.1f} s)") + ".",
                               limits, unit, 7.0, **options))  # fmt: skip
     for basis in ("gimp", "bspline2"):
