@@ -139,7 +139,7 @@ def figure_12(shelf):
         lags = {x: f"{percent(v)} later" if np.isfinite(v) else "never" for x, v in slow.items()}
         good = all(not v <= 0.02 for v in slow.values()) and all(v > 5 for v in noise.values()) and same < 0.1
         verdict = ("holds" if good else "holds in part",
-                   f"The standard front reaches x = 5 m {lags[g]} than with F\u0304 for uGIMP and {lags[b]} for B-splines; its pressure is "
+                   f"The standard front reaches x = 5 m {lags[g]} than with F\u0304 for uGIMP and {lags[b]} for B-splines (how much depends on K); its pressure is "
                    f"{noise[g]:.0f} and {noise[b]:.0f} times as large. With F\u0304 both bases agree on that time within {100 * same:.1f} %. "
                    "The three-field solution of Mast et al. is not at hand.")  # fmt: skip
         if all((x, "anchored") in found for x in (g, b)):
