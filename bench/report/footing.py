@@ -131,8 +131,8 @@ def figure_8(shelf):
                          for s in ("standard", "zhao", "anchored")) for b in ("gimp", "bspline2"))  # fmt: skip
         why = f"q/s_u at h = B/{n}, mean over u/B = {PLATEAU[0]:g} to {PLATEAU[1]:g}: {text}. "
         why += (f"{blown[0].name} fails: {blown[0].why()}." if blown else
-                "<b>The standard B-spline does not blow up here</b>, at no resolution that was run: it is too stiff and its load "
-                "keeps rising. Its incomplete curves in the paper are not reproduced.")  # fmt: skip
+                "<b>The standard B-spline does not blow up here</b>, at no resolution that was run: it is "
+                "too stiff and goes on to the end. Its incomplete curves in the paper are not reproduced.")  # fmt: skip
         verdict = ("holds in part" if cured and locked and not blown else "holds" if cured and locked else "does not hold", why)
     creep = ""
     if len(slow) == 2:
