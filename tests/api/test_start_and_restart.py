@@ -512,7 +512,7 @@ def test_run_without_memory_fails_and_says_how_much_it_wanted(fresh):
     d = fresh("--memory-limit", "1000000000000")
     d.limits = {resource.RLIMIT_AS: 1_000_000_000}  # of which arenas of malloc take up to half
     d.start()
-    d.create(big(particles_per_cell=1024, cell=0.0125), id="big")
+    d.create(big(particles_per_cell=1024, cell=0.0125, time={"dt": 5e-5}), id="big")
     error = d.wait("big", "failed")["error"]
     assert error["kind"] == "memory" and error["value"] is None and error["advice"], error
     assert str(6400 * 1024) in error["detail"], error
