@@ -10,7 +10,6 @@ from harness import contents
 from test_kills import POOL
 
 
-
 def steps_and_snapshots(daemon, run, steps, scene_steps):
     """Runs so many steps and gives the frame that is taken there."""
     daemon.act(run, "step", {"steps": steps})
@@ -22,7 +21,8 @@ def steps_and_snapshots(daemon, run, steps, scene_steps):
 def names():
     from fbard import ROOT
 
-    return sorted(p.stem for p in (ROOT / "scenes").glob("*.json"))
+    scenes = ROOT / "scenes"
+    return sorted(str(p.relative_to(scenes).with_suffix("")) for p in scenes.rglob("*.json"))
 
 
 def scene_of(name):
