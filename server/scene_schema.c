@@ -157,6 +157,32 @@ static cJSON *material_schema(void) {
     return schema;
 }
 
+// What a stage may change of a material: which of these parameters it has depends on its model, which
+// stands elsewhere. A name that several models have means the same in all of them, bounds included.
+static cJSON *material_patch_schema(void) {
+    cJSON *schema = cJSON_CreateObject();
+    put_text(schema, "type", "object");
+    cJSON *properties = cJSON_AddObjectToObject(schema, "properties");
+    for (size_t i = 0; i < mpm_material_count(); i++) {
+        struct scene_material_keys table;
+        scene_material_keys(mpm_material_at(i), &table);
+        for (const struct scene_key *key = table.keys; key->name; key++) {
+            if (key->value.type != SCENE_NUMBER || strcmp(key->name, "density") == 0 ||
+                json_member(properties, key->name))
+                continue;
+            cJSON *property = key_schema(key);
+            cJSON *types = cJSON_CreateArray(); // null: back to the default
+            cJSON_AddItemToArray(types, cJSON_CreateString("number"));
+            cJSON_AddItemToArray(types, cJSON_CreateString("null"));
+            cJSON_DeleteItemFromObjectCaseSensitive(property, "type");
+            cJSON_AddItemToObject(property, "type", types);
+            cJSON_AddItemToObject(properties, key->name, property);
+        }
+    }
+    cJSON_AddFalseToObject(schema, "additionalProperties");
+    return schema;
+}
+
 static cJSON *value_schema(const struct scene_value *value) {
     cJSON *schema = NULL;
     const char *word;
@@ -248,12 +274,10 @@ static cJSON *value_schema(const struct scene_value *value) {
             cJSON_AddItemToArray(forms, value_schema(&value->items[i]));
         break;
     }
-    case SCENE_MATERIAL_PATCH: {
+    case SCENE_MATERIAL_PATCH:
         put_text(schema, "type", "object");
-        cJSON *patch = cJSON_AddObjectToObject(schema, "additionalProperties");
-        put_text(patch, "type", "object");
+        cJSON_AddItemToObject(schema, "additionalProperties", material_patch_schema());
         break;
-    }
     }
     return schema;
 }

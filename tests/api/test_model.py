@@ -116,8 +116,10 @@ class Run:
 
 service = None
 names = iter(f"m{k}" for k in range(10**9))
+# Without NUL: a body that has one in a text is a 400 (test_requests_refused), whatever else is wrong with it.
+texts = st.text(st.characters(min_codepoint=1, blacklist_categories=("Cs",)), max_size=4)
 numbers = st.one_of(st.integers(-3, 200), st.floats(allow_nan=False, allow_infinity=False), st.booleans(), st.none(),
-                    st.text(max_size=4), st.just([]), st.just({}))  # fmt: skip
+                    texts, st.just([]), st.just({}))  # fmt: skip
 
 
 class Model(RuleBasedStateMachine):

@@ -1,5 +1,6 @@
 """The JSON Schema and the daemon's own check come from one table: they agree on randomly damaged scenes."""
 import random
+import re
 
 import jsonschema
 import pytest
@@ -9,6 +10,7 @@ from test_requests_mutated import RICH, mutated
 # Faults of the form of one value, which the schema states as well; the others (range of a time increment,
 # names that lead nowhere, walls off the grid, ...) look at several values or at the whole.
 FORM = {"type", "unknown_key", "required", "enum"}
+PATCHED = re.compile(r"/stages/\d+/materials/[^/]+/")
 
 
 def agree(daemon, seeds):
@@ -26,9 +28,11 @@ def agree(daemon, seeds):
             counts["valid"] += 1
             continue
         assert reply.status == 422, (seed, reply)
-        # What is required only because of another key's value is beyond the form.
+        # What is required only because of another key's value is beyond the form, and so is which parameters a
+        # stage may change of a material: its model stands elsewhere.
         faults = [e for e in reply.json["errors"]
-                  if e["code"] in FORM and (e["code"] != "required" or "is missing:" in e["detail"])]  # fmt: skip
+                  if e["code"] in FORM and (e["code"] != "required" or "is missing:" in e["detail"])
+                  and not (e["code"] == "unknown_key" and PATCHED.search(e["pointer"]))]  # fmt: skip
         assert not (fits and faults), (seed, faults)
         counts["of its form" if faults else "only beyond"] += 1
     return counts
