@@ -20,6 +20,8 @@
 #define RECORD_MAGIC "FREC"
 #define SEGMENT_MAX ((uint64_t)64 << 20) // a new segment beyond this; the unit of dropping
 #define PIECE ((size_t)256 << 10)        // bytes read at a time
+// More records than this no segment holds: it ends with the one that passes SEGMENT_MAX.
+#define SEGMENT_RECORDS (SEGMENT_MAX / (JOURNAL_HEADER + FRAME_PREAMBLE) + 1)
 #define SEGMENTS_MIN 8 // of one budget, so that dropping frees an eighth of it at most
 
 // ---- Frames: reading back ---------------------------------------------------------------------
@@ -225,7 +227,9 @@ static bool segment_open(struct journal *j, uint32_t number, bool last, char *wh
             journal_explain(why, "%.400s: damaged header at byte 0", path);
     } else {
         segment.first_seq = journal_take64(header + 16);
-        if (j->n_segments == 0) { // earlier ones were dropped
+        // Else an index as long as the header says would be made for frames that never were.
+        const bool possible = segment.first_seq <= number * SEGMENT_RECORDS;
+        if (j->n_segments == 0 && possible) { // earlier ones were dropped
             j->chain = journal_take64(header + 24);
             while (j->n_frames < segment.first_seq &&
                    journal_grow((void **)&j->frames, &j->frames_capacity, j->n_frames + 1,
@@ -235,7 +239,11 @@ static bool segment_open(struct journal *j, uint32_t number, bool last, char *wh
             }
             j->n_gone = j->n_frames;
         }
-        if (journal_take64(header + 24) != j->chain || segment.first_seq != j->n_frames)
+        if (!possible)
+            journal_explain(why,
+                            "%.400s: begins with frame %llu, which so few segments cannot hold",
+                            path, (unsigned long long)segment.first_seq);
+        else if (journal_take64(header + 24) != j->chain || segment.first_seq != j->n_frames)
             journal_explain(why, "%.400s: does not follow the segment before it", path);
         else
             whole = segment_scan(j, &segment, fd, last, path, why);
