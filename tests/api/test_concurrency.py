@@ -181,15 +181,15 @@ def test_thousand_runs_come_and_go(daemon):
 def test_runs_side_by_side_share_the_cores_fairly_and_keep_their_bits(fresh):
     """More threads than cores where there are two or three; each run ends as when it is alone."""
     d = fresh(slots=4, threads=1).start()
-    scene = water(time={"end": 6}, output={"interval": 1})
+    scene = water(time={"end": 12}, output={"interval": 2})
     d.create(scene, id="alone")
     d.wait("alone", "completed")
     runs = [d.create(scene, id=f"r{k}")["id"] for k in range(4)]
-    until(lambda: max(d.run(run)["step"] for run in runs) >= 4000)
+    until(lambda: max(d.run(run)["step"] for run in runs) >= 10000)
     steps = [d.run(run)["step"] for run in runs]
     # Equal threads get equal shares of the kernel, once they have run for many of its time slices (250 steps are only
-    # one to three of them): a third of the fastest is far from its noise.
-    assert min(steps) > max(steps) / 3, steps
+    # one to three of them). The worst that it may do for long on two cores is three of the four on one: a third.
+    assert min(steps) > max(steps) / 4, steps
     for run in runs:
         d.wait(run, "completed")
         assert [f["step"] for f in d.frames(run)] == [f["step"] for f in d.frames("alone")]
