@@ -1,7 +1,7 @@
 """What journal and recording cost a run, what stalled viewers cost it, and how fast fbar records. Timings are
 of pairs, one right after the other in turns, so that what else the machine does meets both; ratios count.
 
-    make bench-recording                  all of it, about two minutes
+    make bench-recording                  all of it, about three minutes
     python3 bench/recording.py cost       one part: cost, viewers, throughput
 """
 import os
@@ -21,9 +21,9 @@ from boxes import merged, water  # noqa: E402
 from fbard import Daemon, until  # noqa: E402
 
 FBAR = os.environ.get("FBAR") or str(ROOT / "build" / "fbar")
-DT, STEPS, EVERY, PAIRS = 1e-4, 100, 10, 8
+DT, EVERY, PAIRS = 1e-4, 10, 8
 # 102,400 particles in 2D.
-SCENE = water(cell=0.05, time={"end": STEPS * DT, "dt": DT}, bodies={"pool": {"particles_per_cell": 256}},
+SCENE = water(cell=0.05, time={"dt": DT}, bodies={"pool": {"particles_per_cell": 256}},
               output={"interval": 1e6, "probe_interval": 10 * DT})  # fmt: skip
 
 
@@ -46,6 +46,18 @@ def pairs(title, plain, other):
     return statistics.median(ratios)
 
 
+def cpu_seconds(daemon, *names):
+    """Of the daemon's threads with these names."""
+    spent = 0
+    for task in pathlib.Path(f"/proc/{daemon.process.pid}/task").iterdir():
+        try:
+            if (task / "comm").read_text().strip() in names:
+                spent += 1e-9 * int((task / "schedstat").read_text().split()[0])
+        except (FileNotFoundError, ProcessLookupError):
+            pass  # it ended
+    return spent
+
+
 def record(daemon, run, folder, *words):
     return subprocess.Popen([FBAR, "--url", daemon.http, "record", run, "-o", str(folder / "a.h5"), *words],
                             stdout=subprocess.DEVNULL)  # fmt: skip
@@ -56,24 +68,24 @@ def remove(folder):
         path.unlink()
 
 
-def cost(daemon, folder):
+def cost(daemon, folder, steps=600, every=100):
+    scene = merged(SCENE, {"time": {"end": steps * DT}})
     output = []
 
     def plain():
-        daemon.create(SCENE, id="plain")
+        daemon.create(scene, id="plain")
         run = daemon.wait("plain", "completed")
         daemon.away("plain")
         return seconds_per_step(run)
 
     def recorded():
-        scene = merged(SCENE, {"output": {"interval": EVERY * DT}})
-        daemon.create(scene, id="recorded", start=False)
+        daemon.create(merged(scene, {"output": {"interval": every * DT}}), id="recorded", start=False)
         recorder = record(daemon, "recorded", folder)
         until(lambda: daemon.run("recorded")["recorders"])
         daemon.act("recorded", "resume")
         run = daemon.wait("recorded", "completed")
         assert recorder.wait() == 0
-        assert len(daemon.frames("recorded")) == STEPS // EVERY + 1
+        assert len(daemon.frames("recorded")) == steps // every + 1
         phases = run["performance"]["phases"]
         output.append((phases["output"] + phases["waiting"]) / run["performance"]["wall_s"])
         daemon.away("recorded")
@@ -81,21 +93,32 @@ def cost(daemon, folder):
         return seconds_per_step(run)
 
     plain()
-    ratio = pairs(f"journal and recording, {STEPS} steps, a frame every {EVERY}", plain, recorded)
-    own = statistics.median(output)
-    print(f"  the run's own thread spends {100 * own:.2f} % on frames and on waiting for their room; with a frame "
-          f"every 100 steps a tenth: {10 * own:.3f} %, in all {10 * (ratio - 1):.2f} %")
+    pairs(f"journal and recording, {steps} steps, a frame every {every}", plain, recorded)
+    print(f"  the run's own thread spends {100 * statistics.median(output):.2f} % on frames and on waiting for their room")
 
 
 def viewers(daemon, folder):
-    # Long enough that what fills the viewers' socket buffers, once, is not what is measured: 40 frames of 4 MB.
-    scene = merged(SCENE, {"time": {"end": 40 * EVERY * DT}, "output": {"interval": EVERY * DT}})
+    # First 40 frames of 4 MB, which fill what the viewers and the kernel take in before they are stalled: a copy of
+    # 10 to 20 MB a viewer, once. Then 40 more.
+    half = 40 * EVERY * DT
+    scene = merged(SCENE, {"time": {"end": 2 * half}, "output": {"interval": EVERY * DT}})
+    filling = {"alone": [], "watched": []}
+    output = {"alone": [], "watched": []}
+
+    def second_half(name):
+        daemon.create(scene, id=name, start=False)
+        daemon.act(name, "step", {"until": half})
+        first = daemon.wait(name, "paused")
+        before = cpu_seconds(daemon, "publish", "ZMQbg/IO/0")
+        daemon.act(name, "resume")
+        run = daemon.wait(name, "completed")
+        output[name].append(cpu_seconds(daemon, "publish", "ZMQbg/IO/0") - before)
+        daemon.away(name)
+        filling[name].append(seconds_per_step(first))
+        return 2 * seconds_per_step(run) - seconds_per_step(first)
 
     def alone():
-        daemon.create(scene, id="alone")
-        run = daemon.wait("alone", "completed")
-        daemon.away("alone")
-        return seconds_per_step(run)
+        return second_half("alone")
 
     def watched():
         context = zmq.Context()
@@ -105,15 +128,17 @@ def viewers(daemon, folder):
             viewer.subscribe(b"run/")
             viewer.connect(daemon.publish)
         time.sleep(0.5)
-        daemon.create(scene, id="watched")
-        run = daemon.wait("watched", "completed")
+        took = second_half("watched")
         for viewer in stalled:
             viewer.close(0)
         context.term()
-        daemon.away("watched")
-        return seconds_per_step(run)
+        return took
 
     pairs(f"16 viewers that stall, a frame every {EVERY} steps", alone, watched)
+    ratios = [w / a for a, w in zip(filling["alone"], filling["watched"])]
+    spent = [1e3 * statistics.median(output[name]) for name in output]
+    print(f"  the output threads' CPU time for these 40 frames: {spent[0]:.0f} ms without, {spent[1]:.0f} ms with them")
+    print(f"  while the buffers of the 16 fill (the first 40 frames): ratio {statistics.median(ratios):.3f}")
 
 
 def throughput(daemon, folder):

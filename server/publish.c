@@ -324,6 +324,7 @@ static void work_on(struct publisher *p, struct outlet *o) {
 
 static void *publisher_thread(void *argument) {
     struct publisher *p = argument;
+    pthread_setname_np(pthread_self(), "publish");
     pthread_mutex_lock(&p->lock);
     for (;;) {
         read_subscriptions(p);

@@ -547,7 +547,9 @@ static void close_door(struct run *r) {
 
 void *run_thread(void *argument) {
     struct run *r = argument;
-    char why[JOURNAL_WHY];
+    char why[JOURNAL_WHY], title[16];
+    snprintf(title, sizeof title, "run %.11s", r->id); // and its solver threads, for `top -H`
+    pthread_setname_np(pthread_self(), title);
     if (r->now.state == RUN_QUEUED)
         slots_ask(r->host->slots, &r->slot, r->sim_bytes);
     while (!run_state_is_final(r->now.state) && !atomic_load(&r->stop)) {

@@ -111,6 +111,7 @@ static bool answer(const struct zap *z) {
 
 static void *zap_thread(void *argument) {
     struct zap *z = argument;
+    pthread_setname_np(pthread_self(), "zap");
     while (answer(z))
         continue;
     zmq_close(z->socket);
