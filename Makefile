@@ -4,7 +4,7 @@
 # The one list of what a fresh Debian 12 machine lacks.
 PACKAGES = build-essential pkg-config libmicrohttpd-dev libcjson-dev libzmq3-dev libhdf5-dev \
 	libcurl4-gnutls-dev libxxhash-dev libcmocka-dev gnuplot-nox fonts-dejavu-core curl openssl \
-	python3 python3-numpy python3-h5py python3-pytest python3-zmq python3-jsonschema \
+	python3 python3-numpy python3-h5py python3-pytest python3-pytest-xdist python3-zmq python3-jsonschema \
 	python3-hypothesis slowhttptest libjs-chart.js
 # Needed by some targets only: the browser that tests the live page, and npm where there is no other one; clang
 # builds and the fuzzers; `make check-long`.
@@ -238,8 +238,9 @@ PYTEST = $(PYTHON) -m pytest -q -p no:cacheprovider
 check-api: all ## black-box tests of the daemon
 	$(Q)FBARD=$(CURDIR)/$(B)/fbard FBAR=$(CURDIR)/$(B)/fbar $(PYTEST) tests/api
 
+# Files of tests side by side: most of their time goes into starting programs and waiting for them.
 check-cli: all ## black-box tests of the client
-	$(Q)FBARD=$(CURDIR)/$(B)/fbard FBAR=$(CURDIR)/$(B)/fbar $(PYTEST) tests/cli
+	$(Q)FBARD=$(CURDIR)/$(B)/fbard FBAR=$(CURDIR)/$(B)/fbar $(PYTEST) -n 2 --dist loadfile tests/cli
 
 # The lock file's playwright-core drives Debian's chromium; it is installed into build/page, never into the tree.
 PAGE_MODULES = build/page/node_modules

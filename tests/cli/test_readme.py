@@ -14,7 +14,7 @@ import conftest
 README = (conftest.ROOT / "README.md").read_text()
 ADDRESS = "http://127.0.0.1:7800"
 # Makes the dam break, full size and 2 GPa in the README, a matter of a second.
-SHORT = ["--set", "materials.water.bulk_modulus=2e7", "--set", "time.dt=null", "--set", "time.cfl=0.3",
+SHORT = ["--set", "materials.water.bulk_modulus=2e6", "--set", "time.dt=null", "--set", "time.cfl=0.3",
          "--set", "time.end=0.45"]
 
 pytestmark = pytest.mark.skipif(not os.access(conftest.FBARD, os.X_OK), reason="fbard is not built")
@@ -101,10 +101,11 @@ def test_make_lines():
     """The targets exist, those named in the text too; running them is their own business."""
     shown = [word for words in commands() if words[0] == "make" for word in words[1:] if word[0] != "-"]
     assert ["make", "deps"] in commands() and "`make demo`" in README and "`make check`" in README
-    for target in {*shown, *re.findall(r"`make ([a-z-]+)`", README)}:
-        done = subprocess.run(["make", "-n", target], cwd=conftest.ROOT, capture_output=True, text=True,
-                              env={k: v for k, v in os.environ.items() if k not in ("MAKEFLAGS", "MFLAGS")})
-        assert done.returncode == 0, done.stderr
+    # All at once, and MAKE=: so that no part is read anew for each target that calls it: all are targets of their own.
+    targets = {*shown, *re.findall(r"`make ([a-z-]+)`", README)}
+    done = subprocess.run(["make", "-n", "MAKE=:", *sorted(targets)], cwd=conftest.ROOT, capture_output=True, text=True,
+                          env={k: v for k, v in os.environ.items() if k not in ("MAKEFLAGS", "MFLAGS")})
+    assert done.returncode == 0, done.stderr
 
 
 def places(path):
