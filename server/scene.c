@@ -681,6 +681,7 @@ static bool read_definition(struct scene *scene) {
     def->settings = scene->config.settings;
     read_body_force(json_member(root, "body_force"), &def->body_force);
     def->unstable_ok = flag(root, "unstable_ok") || flag(json_member(root, "time"), "unstable_ok");
+    def->walls_hold_nodes = !flag(root, "mirror_walls");
     def->memory_limit = physical_memory();
     def->wants_displacement = wants(root, MPM_FIELD_DISPLACEMENT);
     def->wants_volume_ratio = wants(root, MPM_FIELD_VOLUME_RATIO);

@@ -642,6 +642,13 @@ static const struct scene_key root_keys[] = {
      .required = true,
      .doc = "what is filled with particles"},
     {"walls", {.type = SCENE_MAP, .items = &wall}, .fallback = "{}", .doc = "plane boundaries"},
+    {"mirror_walls", BOOL, .fallback = "true",
+     .doc = "B-splines: a wall is the mirror plane of an image of the body, so that its condition "
+            "holds "
+            "exactly on it; `false` holds the nodes on and behind it instead, as other codes do "
+            "(and as "
+            "the other bases always do): the body then slips through at an eighth (quadratic) or a "
+            "sixth (cubic) of the velocity one cell away"},
     {"loads",
      {.type = SCENE_MAP, .items = &load},
      .fallback = "{}",

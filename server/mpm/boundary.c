@@ -1,17 +1,20 @@
-// Wall conditions on the grid: direct for uGIMP and linear, mirror-folded for B-splines.
+// Wall conditions on the grid: direct for uGIMP and linear, mirror-folded for B-splines (direct
+// there, too, where the scene asks for it).
 #include "server/mpm/boundary.h"
 
 #include <stdlib.h>
 #include <string.h>
 
-void mpm_wall_create(struct mpm_wall *wall, const struct mpm_wall_def *def,
-                     const struct mpm_grid *grid, enum mpm_basis basis, bool wants_reaction) {
+void mpm_wall_create(struct mpm_wall *wall, const struct mpm_def *whole, size_t number,
+                     const struct mpm_grid *grid, bool wants_reaction) {
+    const struct mpm_wall_def *def = &whole->walls[number];
     *wall = (struct mpm_wall){.def = *def, .active = true, .wants_reaction = wants_reaction};
     const int axis = def->axis;
     wall->plane = (int)lround((def->at - grid->origin[axis]) * grid->inv_h);
     wall->ghost = wall->plane + (def->keeps_above ? -1 : 1);
     wall->inner = wall->plane + (def->keeps_above ? 1 : -1);
-    wall->folds = basis == MPM_BSPLINE2 || basis == MPM_BSPLINE3;
+    wall->folds =
+        (whole->basis == MPM_BSPLINE2 || whole->basis == MPM_BSPLINE3) && !whole->walls_hold_nodes;
     for (int d = 0; d < MPM_MAX_DIM; d++) {
         wall->lo[d] = 0;
         wall->hi[d] = grid->n[d];

@@ -36,9 +36,9 @@ struct mpm_beyond {
     uint32_t node, column;
 };
 
-// `wants_reaction`: a probe asks for it.
-void mpm_wall_create(struct mpm_wall *wall, const struct mpm_wall_def *def,
-                     const struct mpm_grid *grid, enum mpm_basis basis, bool wants_reaction);
+// The definition's wall of that number. `wants_reaction`: a probe asks for it.
+void mpm_wall_create(struct mpm_wall *wall, const struct mpm_def *def, size_t number,
+                     const struct mpm_grid *grid, bool wants_reaction);
 void mpm_wall_free(struct mpm_wall *wall);
 
 // Adds to the grid's blocks what folding walls need: where one of a column's three nodes exists,

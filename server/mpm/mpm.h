@@ -335,6 +335,8 @@ struct mpm_def {
     struct mpm_settings settings;
     struct mpm_body_force_def body_force;
     bool unstable_ok; // accept a dt above the stability limit
+    // With B-splines, too, walls hold the nodes on and beyond them instead of mirror-folding them.
+    bool walls_hold_nodes;
     size_t n_materials, n_bodies, n_walls, n_loads, n_rigids, n_stages, n_probes;
     const struct mpm_material_def *materials;
     const struct mpm_body_def *bodies;

@@ -66,7 +66,9 @@ double mpm_dt_limit(const struct mpm_sim *sim) {
 
 double mpm_next_dt(const struct mpm_sim *sim) {
     const struct mpm_clockwork *c = &sim->c;
-    const double dt = c->now.dt > 0 ? c->now.dt : c->now.cfl / mpm_stability_of(sim->def).wave * mpm_dt_limit(sim);
+    const double dt = c->now.dt > 0
+                          ? c->now.dt
+                          : c->now.cfl / mpm_stability_of(sim->def).wave * mpm_dt_limit(sim);
     const double left = c->stage_end - c->time;
     // Fit the last step to the end, but leave a whole step whole whatever round-off says.
     return left > 0 && left < dt * (1 - 1e-6) ? left : dt;
@@ -444,8 +446,8 @@ enum mpm_status mpm_create(const struct mpm_def *def, struct mpm_sim **out, stru
         goto fail;
     }
     for (; sim->n_walls < def->n_walls; sim->n_walls++) {
-        mpm_wall_create(&sim->walls[sim->n_walls], &def->walls[sim->n_walls], &sim->grid,
-                        def->basis, wants_reaction(def, sim->n_walls));
+        mpm_wall_create(&sim->walls[sim->n_walls], def, sim->n_walls, &sim->grid,
+                        wants_reaction(def, sim->n_walls));
     }
     for (; sim->n_rigids < def->n_rigids; sim->n_rigids++) {
         if (!mpm_rigid_create(&sim->rigids[sim->n_rigids], &def->rigids[sim->n_rigids],
@@ -496,8 +498,9 @@ fail:
     mpm_free(sim);
     struct mpm_estimate estimate; // what was to be made, not how far it came
     mpm_estimate(def, &estimate);
-    return mpm_fail(err, MPM_ERR_MEMORY, "", "no memory for %zu particles and their grid: %zu bytes",
-                    estimate.particles, estimate.bytes);
+    return mpm_fail(err, MPM_ERR_MEMORY, "",
+                    "no memory for %zu particles and their grid: %zu bytes", estimate.particles,
+                    estimate.bytes);
 }
 
 void mpm_free(struct mpm_sim *sim) {
@@ -576,7 +579,7 @@ void mpm_estimate(const struct mpm_def *def, struct mpm_estimate *out) {
     }
     struct mpm_wall *walls = calloc(def->n_walls + 1, sizeof *walls);
     for (size_t k = 0; walls && k < def->n_walls; k++) {
-        mpm_wall_create(&walls[k], &def->walls[k], &c.grid, def->basis, false);
+        mpm_wall_create(&walls[k], def, k, &c.grid, false);
     }
     c.out_of_memory |= !walls || !mpm_walls_activate(walls, def->n_walls, &c.grid);
     free(walls);
@@ -666,9 +669,9 @@ enum mpm_status mpm_change(struct mpm_sim *sim, const struct mpm_settings *setti
                            struct mpm_error *err) {
     struct mpm_settings now = sim->c.now;
     overlay(&now, settings, which);
-    const enum mpm_status status = mpm_check_settings(
-        &now, "", sim->def->dimension, mpm_dt_limit(sim), mpm_stability_of(sim->def).wave,
-        sim->def->unstable_ok, err);
+    const enum mpm_status status =
+        mpm_check_settings(&now, "", sim->def->dimension, mpm_dt_limit(sim),
+                           mpm_stability_of(sim->def).wave, sim->def->unstable_ok, err);
     if (status) {
         return status;
     }

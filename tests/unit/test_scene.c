@@ -424,6 +424,10 @@ static void test_scene_passes_on_faults_of_the_solver(void **state) {
                  "/bodies/pool/shape", "memory");
     scene_free(create("{\"time\":{\"dt\":1},\"unstable_ok\":true}"));
     scene_free(create("{\"time\":{\"dt\":1,\"unstable_ok\":true}}"));
+    struct scene *held = create("{\"mirror_walls\":false}"), *mirrored = create("{}");
+    assert_true(held->def.walls_hold_nodes && !mirrored->def.walls_hold_nodes);
+    scene_free(held);
+    scene_free(mirrored);
 }
 
 // ---- Shapes, loads and plasticity ---------------------------------------------------------------
