@@ -420,12 +420,13 @@ static void test_scene_passes_on_faults_of_the_solver(void **state) {
     assert_fault("{\"bodies\":{\"ball\":{\"shape\":{\"disk\":{\"center\":[2,9]}}}}}",
                  "/bodies/ball/shape", "range");
     assert_fault("{\"cell\":1e-6}", "/cell", "range");
-    assert_fault("{\"cell\":1e-3,\"time\":{\"dt\":1e-7},\"bodies\":{\"pool\":{\"particles_per_cell\":1024}}}",
+    assert_fault("{\"cell\":1e-3,\"time\":{\"dt\":1e-7},\"bodies\":{\"pool\":{\"particles_per_"
+                 "cell\":1024}}}",
                  "/bodies/pool/shape", "memory");
     scene_free(create("{\"time\":{\"dt\":1},\"unstable_ok\":true}"));
     scene_free(create("{\"time\":{\"dt\":1,\"unstable_ok\":true}}"));
     struct scene *held = create("{\"mirror_walls\":false}"), *mirrored = create("{}");
-    assert_true(held->def.walls_hold_nodes && !mirrored->def.walls_hold_nodes);
+    assert_true(scene_def(held)->walls_hold_nodes && !scene_def(mirrored)->walls_hold_nodes);
     scene_free(held);
     scene_free(mirrored);
 }
