@@ -82,7 +82,7 @@ $(call levels,$(LANES_SRC)): ALL_CFLAGS += $(LANES_FLAGS)
 .PHONY: studies all programs deps deps-page deps-long deps-report libmpm demo report report-page report-docs check check-all check-layers check-unit \
 	check-physics check-api check-page \
 	check-cli check-loss check-hard check-asan check-clang check-fuzz check-tsan unit-programs check-long bench bench-solver bench-peer \
-	bench-recording bench-status fuzz install uninstall format clean help
+	bench-recording bench-status bench-threads fuzz install uninstall format clean help
 .DELETE_ON_ERROR:
 .SECONDARY:
 
@@ -305,7 +305,7 @@ check-clang: ## warnings and unit tests with clang 14
 check-long: deps-long deps-page ## the longer verification: minutes to hours
 	@FBARD_LONG=1 $(MAKE) --no-print-directory check-all check-clang check-tsan
 
-bench: bench-solver bench-recording bench-status ## speed: the kernels, what recording costs, how fast the daemon answers
+bench: bench-solver bench-recording bench-status bench-threads ## speed: the kernels, what recording costs, how fast the daemon answers, when threads pay
 
 bench-solver: $(B)/bench-solver ## kernels against the plain ones, ratios and growth; JSON in build/bench.json
 	$(Q)GOMP_SPINCOUNT=$(SPIN) $< --json build/bench.json $(BENCH)
@@ -315,6 +315,9 @@ bench-peer: ## how to run the same block problem with another code
 
 bench-recording: all ## what journal and recording cost a run, and how fast fbar records
 	$(Q)FBARD=$(CURDIR)/$(B)/fbard FBAR=$(CURDIR)/$(B)/fbar $(PYTHON) bench/recording.py
+
+bench-threads: all ## what a second thread is worth to runs of several sizes, on free and on busy cores
+	$(Q)FBARD=$(CURDIR)/$(B)/fbard $(PYTHON) bench/threads.py
 
 bench-status: all ## how fast the daemon answers while a run uses all cores, and what that costs the run
 	$(Q)FBARD=$(CURDIR)/$(B)/fbard $(PYTHON) bench/status.py

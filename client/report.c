@@ -162,8 +162,12 @@ void report_run(const cJSON *run) {
     printf("step       %.0f, t = %.6g s of %.6g s, dt = %.4g s\n", number(run, "step"),
            number(run, "time"), number(run, "end_time"), number(run, "dt"));
     printf("particles  %.0f, F-bar %s\n", number(run, "particles"), fbar_word(run));
-    printf("speed      %.3g million particle-steps/s, %s\n",
+    printf("speed      %.3g million particle-steps/s, %s",
            1e-6 * number(performance, "particle_steps_per_s"), wall);
+    const double threads = number(performance, "threads");
+    if (threads > 0)
+        printf(" on %.0f thread%s", threads, threads > 1 ? "s" : "");
+    putchar('\n');
     cJSON_ArrayForEach(item, balance) {
         printf("%-10s %s = ", item == balance->child ? "balance" : "", item->string);
         print_value(item);

@@ -53,6 +53,7 @@ static int run_daemon(const struct options *options, const sigset_t *signals) {
     struct routes routes = {.options = options};
     struct run_host host = {.data_dir = options->data_dir,
                             .threads = options->threads,
+                            .threads_fit = !options->threads_given,
                             .isa = options->isa,
                             .memory_limit = options->memory_limit};
     struct http_server *http = NULL;

@@ -128,7 +128,7 @@ static bool parse_resume(const char *text, enum options_resume *out) {
     X(HTTP, "--http", "HOST:PORT", "address of the HTTP API (127.0.0.1:7800); port 0 picks one")   \
     X(PUBLISH, "--publish", "ENDPOINT", "ZeroMQ endpoint of the frames (tcp://127.0.0.1:7801)")    \
     X(DATA_DIR, "--data-dir", "DIR", "one folder a run ($XDG_STATE_HOME/fbard)")                   \
-    X(THREADS, "--threads", "N", "solver threads of a run (cores / slots)")                        \
+    X(THREADS, "--threads", "N", "solver threads of a run (cores / slots; fewer for a small run)") \
     X(SLOTS, "--slots", "N", "runs at a time (1)")                                                 \
     X(QUEUE, "--queue", "N", "unfinished runs beyond --slots, paused ones included (64)")          \
     X(RESUME, "--resume", "auto|paused|off",                                                       \
@@ -223,6 +223,7 @@ static bool assign(struct options *o, enum option option, const char *value) {
     case OPTION_DATA_DIR:
         return *value != '\0' && copy(o->data_dir, sizeof o->data_dir, value);
     case OPTION_THREADS:
+        o->threads_given = true;
         return parse_int(value, MAX_THREADS, &o->threads);
     case OPTION_SLOTS:
         return parse_int(value, MAX_THREADS, &o->slots);

@@ -17,7 +17,8 @@ struct options {
     char token_file[4096], tls_cert[4096], tls_key[4096], port_file[4096], curve_dir[4000];
     enum options_resume resume;
     bool insecure;
-    int threads;                   // solver threads of one run
+    int threads;                   // solver threads of one run, at the most
+    bool threads_given;            // --threads says so: small runs have as many
     int slots;                     // runs at a time
     int queue;                     // runs that may wait for a slot
     size_t memory_limit, max_body; // bytes

@@ -78,6 +78,7 @@ static cJSON *performance_json(const struct run_status *status) {
     reply_add(json, "particle_steps_per_s", status->wall_s > 0 ? work / status->wall_s : NAN);
     reply_add(json, "bytes_per_particle",
               status->particles > 0 ? (double)status->bytes / (double)status->particles : NAN);
+    reply_add(json, "threads", status->threads > 0 ? status->threads : NAN);
     phases = cJSON_AddObjectToObject(json, "phases");
     for (int k = 0; k < RUN_N_PHASES; k++)
         reply_add(phases, run_phase_name(k), status->phases[k]);

@@ -368,6 +368,13 @@ void run_release(struct run *r) {
         run_free(r);
 }
 
+int run_threads(const struct run_host *host, uint64_t particles) {
+    const uint64_t repaid = particles / RUN_PARTICLES_PER_THREAD;
+    if (!host->threads_fit || repaid >= (uint64_t)host->threads)
+        return host->threads;
+    return repaid > 1 ? (int)repaid : 1;
+}
+
 // What the scene alone says of the run, so that a run that waits for its slot can be shown.
 static void describe_from_scene(struct run *r) {
     struct mpm_def *def = scene_def(r->scene);
@@ -376,7 +383,9 @@ static void describe_from_scene(struct run *r) {
     def->isa = r->host->isa;
     def->clock = run_clock;
     def->memory_limit = r->host->memory_limit;
-    mpm_estimate(def, &estimate);
+    mpm_estimate(def, &estimate); // of memory for all threads, some kB more than for fewer
+    def->n_threads = run_threads(r->host, estimate.particles);
+    r->now.threads = def->n_threads;
     double before = 0; // the last stage begins at t = 0
     for (size_t k = 0; k + 1 < def->n_stages; k++)
         before += def->stages[k].duration;

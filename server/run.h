@@ -81,6 +81,7 @@ struct run_error {
 struct run_status {
     enum run_state state;
     uint64_t step, stage, particles, nodes, bytes;
+    int threads;
     double time, start_time, end_time; // s
     double dt, dt_limit;               // s, of the next step
     double eta_s;                      // s of wall time, NaN when unknown
@@ -128,12 +129,19 @@ struct run_host {
     const char *data_dir;
     struct publisher *publisher;
     struct slots *slots;
-    int threads;
+    int threads;      // of a run,
+    bool threads_fit; // or fewer, as many as its size repays (run_threads)
     enum mpm_isa isa;
     size_t memory_limit;
     struct run_meters *meters; // may be NULL
     struct run_bell *bell;     // may be NULL
 };
+
+// Particles that repay a thread: with fewer each, the barriers of a step take longer than its work is
+// shortened by, many times longer where other programs want the cores (`make bench-threads`).
+#define RUN_PARTICLES_PER_THREAD 8192
+// Solver threads of a run of so many particles. Its results do not depend on them.
+int run_threads(const struct run_host *host, uint64_t particles);
 
 // The warnings that the scene alone calls for, of the F-bar, dt and dt_limit in `status`.
 void run_warn_scene(struct run_status *status, const struct mpm_def *def);

@@ -124,7 +124,7 @@ class Daemon:
         return [
             PROGRAM, "--http", "127.0.0.1:0", "--publish", "tcp://127.0.0.1:0",
             "--port-file", str(self.folder / "ports.json"), "--data-dir", str(self.data),
-            "--slots", str(self.slots), "--threads", str(self.threads), *self.options,
+            "--slots", str(self.slots), *(["--threads", str(self.threads)] if self.threads else []), *self.options,
         ]  # fmt: skip
 
     def start(self):

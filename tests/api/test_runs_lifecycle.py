@@ -16,7 +16,7 @@ RUN = {
     "performance": dict, "balance": dict, "probes": dict, "accuracy": list,
 }  # fmt: skip
 PERFORMANCE = {"wall_s": NUMBER, "particle_steps_per_s": (int, float, type(None)),
-               "bytes_per_particle": NUMBER, "phases": dict}  # fmt: skip
+               "bytes_per_particle": NUMBER, "threads": int, "phases": dict}  # fmt: skip
 BALANCE = {"mass", "momentum", "angular_momentum", "kinetic_energy", "strain_energy", "external_work"}
 
 

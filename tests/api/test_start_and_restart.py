@@ -80,6 +80,15 @@ def test_version_resource_describes_the_daemon(daemon):
     assert "threads" in text and "limits" in about
 
 
+def test_small_runs_have_fewer_threads_unless_told_otherwise(fresh):
+    """`--help`: cores / slots; fewer for a small run (one for each 8,192 particles)."""
+    for threads, small, large in ((None, 1, min(len(os.sched_getaffinity(0)), 51200 // 8192)), (3, 3, 3)):
+        d = fresh(slots=1, threads=threads).start()
+        for cell, particles, wanted in ((0.25, 3200, small), (0.0625, 51200, large)):
+            run = d.create("dam-break", start=False, overrides={"cell": cell})
+            assert (run["particles"], run["performance"]["threads"]) == (particles, wanted)
+
+
 def test_busy_http_port_is_an_error_that_names_it(daemon, tmp_path):
     message = refused("--http", daemon.host, "--publish", "tcp://127.0.0.1:0", "--data-dir", tmp_path / "d")
     assert daemon.host.split(":")[1] in message

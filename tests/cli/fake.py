@@ -199,7 +199,7 @@ class Fake:
                 "step": last["step"], "time": last["time"], "end_time": 0.01 * len(self.frames),
                 "progress": self.ready / len(self.frames), "eta_s": 1.0, "dt": 1e-4, "fbar": True,
                 "particles": last["count"], "error": None, "warnings": [],
-                "performance": {"wall_s": 1.0, "particle_steps_per_s": 1e6},
+                "performance": {"wall_s": 1.0, "particle_steps_per_s": 1e6, "threads": 2},
                 "balance": {"mass": 1.0}, "probes": last["probes"], "accuracy": [],
                 "changes": self.changes}
 

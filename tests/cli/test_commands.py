@@ -87,7 +87,7 @@ def test_list_and_show(fbar, fake):
     assert json.loads(fbar("--json", "list", url=daemon.url).stdout)["runs"][0]["id"] == "r1"
     assert json.loads(fbar("list", "--json", url=daemon.url).stdout)["runs"][0]["id"] == "r1"
     result = fbar("show", "r1", url=daemon.url)
-    assert result.returncode == 0 and "50.0 %" in result.stdout
+    assert result.returncode == 0 and "50.0 %" in result.stdout and "1 s on 2 threads\n" in result.stdout
     assert json.loads(fbar("show", "--json", "r1", url=daemon.url).stdout)["step"] == 900
 
 

@@ -28,7 +28,7 @@ static void test_options_defaults_are_loopback(void **state) {
     assert_string_equal(options.http_port, "7800");
     assert_string_equal(options.publish, "tcp://127.0.0.1:7801");
     assert_int_equal(options.slots, 1);
-    assert_true(options.threads >= 1);
+    assert_true(options.threads >= 1 && !options.threads_given);
     assert_int_equal(options.resume, OPTIONS_RESUME_AUTO);
     assert_int_equal(options.max_body, 8 << 20);
 }
@@ -42,7 +42,7 @@ static void test_options_values_are_read(void **state) {
     assert_string_equal(options.http_host, "::1");
     assert_string_equal(options.http_port, "0");
     assert_string_equal(options.publish, "tcp://127.0.0.1:*");
-    assert_int_equal(options.threads, 3);
+    assert_true(options.threads == 3 && options.threads_given);
     assert_int_equal(options.slots, 2);
     assert_int_equal(options.resume, OPTIONS_RESUME_OFF);
     assert_int_equal(options.memory_limit, (size_t)2 << 30);

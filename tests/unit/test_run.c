@@ -138,6 +138,19 @@ static void test_run_state_names_read_back(void **state) {
     assert_int_equal(run_state_parse("sleeping"), -1);
 }
 
+static void test_run_threads_follow_its_size(void **state) {
+    (void)state;
+    struct run_host four = {.threads = 4, .threads_fit = true};
+    const uint64_t each = RUN_PARTICLES_PER_THREAD;
+    const uint64_t size[] = {0, 1, each, 2 * each - 1, 2 * each, 3 * each, 4 * each, UINT64_MAX};
+    const int threads[] = {1, 1, 1, 1, 2, 3, 4, 4};
+    for (size_t k = 0; k < sizeof size / sizeof *size; k++) {
+        assert_int_equal(run_threads(&four, size[k]), threads[k]);
+    }
+    four.threads_fit = false; // the user has said how many
+    assert_int_equal(run_threads(&four, 1), 4);
+}
+
 static void test_run_completes_with_dense_frames(void **state) {
     (void)state;
     struct run *run = begin("complete", true, "{}");
@@ -362,6 +375,7 @@ int main(int argc, char **argv) {
     const struct CMUnitTest tests[] = {
         cmocka_unit_test(test_run_final_states_refuse_all_but_their_own),
         cmocka_unit_test(test_run_state_names_read_back),
+        cmocka_unit_test(test_run_threads_follow_its_size),
         cmocka_unit_test(test_run_completes_with_dense_frames),
         cmocka_unit_test(test_run_step_counts_and_pauses),
         cmocka_unit_test(test_run_snapshot_of_one_step_is_one_frame),
