@@ -162,8 +162,6 @@ def test_every_answer_of_this_session_is_as_declared(daemon, document):
             continue  # a route or method that there is not
         key = (path, method, reply.status)
         counts[key] = counts.get(key, 0) + 1
-        if counts[key] > 200:
-            continue
         response = next((operation["responses"][s] for s in
                          (str(reply.status), f"{reply.status // 100}XX", "default") if s in operation["responses"]),
                         None)  # fmt: skip
