@@ -98,6 +98,39 @@ const char *http_path(const struct http_request *q) {
 const char *http_header(const struct http_request *q, const char *name) {
     return MHD_lookup_connection_value(q->connection, MHD_HEADER_KIND, name);
 }
+struct lines {
+    const char *name;
+    char *text;
+    size_t bytes;
+    bool no_memory;
+};
+
+static enum MHD_Result join_line(void *cls, enum MHD_ValueKind kind, const char *name,
+                                 const char *value) {
+    struct lines *lines = cls;
+    (void)kind;
+    if (strcasecmp(name, lines->name) != 0 || value == NULL)
+        return MHD_YES;
+    size_t n = strlen(value);
+    char *moved = realloc(lines->text, lines->bytes + n + 3);
+    lines->no_memory = moved == NULL;
+    if (moved == NULL)
+        return MHD_NO;
+    lines->text = moved;
+    lines->bytes +=
+        (size_t)sprintf(moved + lines->bytes, "%s%s", lines->bytes > 0 ? ", " : "", value);
+    return MHD_YES;
+}
+
+char *http_header_lines(const struct http_request *q, const char *name) {
+    struct lines lines = {.name = name};
+    MHD_get_connection_values(q->connection, MHD_HEADER_KIND, join_line, &lines);
+    if (lines.no_memory) {
+        free(lines.text);
+        return NULL;
+    }
+    return lines.text;
+}
 const char *http_host(const struct http_request *q) {
     return q->authority != NULL ? q->authority : http_header(q, "Host");
 }

@@ -12,6 +12,9 @@ struct http_request;
 const char *http_method(const struct http_request *request);
 const char *http_path(const struct http_request *request); // as sent, without query, not decoded
 const char *http_header(const struct http_request *request, const char *name); // or NULL
+// All lines of a header, joined with ", " (RFC 9110, 5.3), new; NULL when there is none, or no
+// memory.
+char *http_header_lines(const struct http_request *request, const char *name);
 // Whom the request is for: of a target in absolute form its authority, else the Host header.
 const char *http_host(const struct http_request *request);
 // A query parameter, decoded into `out`; false when it is not there. One that does not fit, or

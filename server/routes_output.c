@@ -4,6 +4,7 @@
 #include <stdlib.h>
 #include <string.h>
 
+#include "server/accept.h"
 #include "server/log.h"
 #include "server/routes_inside.h"
 
@@ -152,10 +153,12 @@ void routes_serve_probes(struct call *c) {
     struct run *run = routes_run_of(c);
     if (run == NULL)
         return;
-    const char *accept = http_header(c->request, "Accept");
-    const char *csv = accept != NULL ? strstr(accept, "text/csv") : NULL;
-    const char *json = accept != NULL ? strstr(accept, "application/json") : NULL;
-    if (csv != NULL && (json == NULL || csv < json))
+    static const char *const types[] = {"application/json", "text/csv"};
+    char *accept = http_header_lines(c->request, "Accept");
+    // Who wants neither gets the first: RFC 9110, 12.5.1 leaves that to the server.
+    bool csv = accept_best(accept, types, sizeof types / sizeof *types) == 1;
+    free(accept);
+    if (csv)
         probes_csv(c, run_series(run), all, after);
     else
         probes_json(c, run_series(run), all, after);

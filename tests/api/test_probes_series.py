@@ -1,9 +1,10 @@
 """The probes' time series, as JSON and as CSV."""
 import csv
+import http.client
 
 import pytest
 from boxes import WATER_STEPS, water
-from fbard import until
+from fbard import PATIENCE, until
 
 
 @pytest.fixture(scope="module")
@@ -74,6 +75,30 @@ def test_json_is_the_default_and_may_be_asked_for(daemon, sampled):
         headers = {"Accept": accept} if accept else {}
         reply = daemon.request("GET", f"/v1/runs/{sampled}/probes", headers=headers)
         assert reply.status == 200 and reply.type == "application/json" or reply.status == 406, reply
+
+
+@pytest.mark.parametrize("lines, type_", [
+    (["text/csv;q=0, */*"], "application/json"),
+    (["text/csv;q=0"], "application/json"),
+    (["application/json;q=0.3, text/csv;q=0.4"], "text/csv"),
+    (["application/json;q=0.3, text/*;q=0.4"], "text/csv"),
+    (["*/*;q=0.9, application/json;q=0.8"], "text/csv"),
+    (["application/json;q=0", "*/*;q=0.1"], "text/csv"),
+    (["application/json;q=0.5", "text/csv;q=0.6"], "text/csv"),
+    (["text/csvx, application/json;q=0.1"], "application/json"),
+    (["application/json;q=0, text/csv;q=0"], "application/json"),  # neither: RFC 9110, 12.5.1
+])  # fmt: skip
+def test_quality_values_decide(daemon, sampled, lines, type_):
+    connection = http.client.HTTPConnection(daemon.host, timeout=PATIENCE)
+    connection.putrequest("GET", f"/v1/runs/{sampled}/probes")
+    for line in lines:
+        connection.putheader("Accept", line)
+    connection.endheaders()
+    answer = connection.getresponse()
+    assert answer.status == 200 and answer.headers.get_content_type() == type_
+    assert answer.headers["vary"] == "Accept"
+    answer.read()
+    connection.close()
 
 
 @pytest.mark.parametrize("since, first", [(0, 10), (9, 10), (10, 20), (95, 100), (100, None), (10**12, None)])
