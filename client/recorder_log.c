@@ -185,18 +185,26 @@ enum recorder_outcome recorder_append_texts(struct recorder *r) {
     return outcome;
 }
 
-// The parameter changes: member "changes" of the run object, where the daemon tells them.
+// The parameter changes, all of them. A daemon without this path has them all in the run object.
 static enum recorder_outcome append_changes(struct recorder *r) {
-    cJSON *run;
-    enum recorder_outcome outcome = recorder_get_json(r, "", &run);
-    const cJSON *changes = cJSON_GetObjectItemCaseSensitive(run, "changes");
+    struct reply reply;
+    enum recorder_outcome outcome = recorder_get(r, "/changes", "application/json", &reply);
+    if (outcome != RECORDER_GOOD)
+        return outcome;
+    cJSON *json = NULL;
+    if (reply.status == 200)
+        json = cJSON_ParseWithLength(reply.body, reply.bytes);
+    else
+        outcome = recorder_get_json(r, "", &json);
+    request_reply_free(&reply);
+    const cJSON *changes = cJSON_GetObjectItemCaseSensitive(json, "changes");
     if (outcome == RECORDER_GOOD && cJSON_IsArray(changes)) {
         char *text = cJSON_PrintUnformatted(changes);
         if (text)
             outcome = append(r, FRAMELOG_CHANGES, text, strlen(text));
         free(text);
     }
-    cJSON_Delete(run);
+    cJSON_Delete(json);
     return outcome;
 }
 

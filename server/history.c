@@ -277,12 +277,29 @@ static bool event_read(struct history *out, uint64_t line, const cJSON *event) {
     return true;
 }
 
-cJSON *history_change_json(uint64_t step, double time, cJSON *patch) {
+cJSON *history_change_json(uint64_t revision, uint64_t step, double time, cJSON *patch) {
     cJSON *json = cJSON_CreateObject();
+    add(json, "revision", (double)revision);
     add(json, "step", (double)step);
     add(json, "time", time);
     cJSON_AddItemToObject(json, "patch", patch);
     return json;
+}
+
+cJSON *history_change_of(const char *line) {
+    static const char start[] = "{\"event\":\"config\""; // as history_event writes it
+    if (strncmp(line, start, sizeof start - 1) != 0)
+        return NULL;
+    struct faults faults = {0};
+    cJSON *event = json_parse(line, strlen(line), &faults), *change = NULL;
+    if (event != NULL)
+        change = history_change_json((uint64_t)fmax(number(event, "revision", 0), 0),
+                                     (uint64_t)fmax(number(event, "step", 0), 0),
+                                     number(event, "time", NAN),
+                                     cJSON_Duplicate(json_member(event, "patch"), true));
+    cJSON_Delete(event);
+    faults_free(&faults);
+    return change;
 }
 
 bool history_read(const char *given, size_t bytes, struct history *out, char *why) {
@@ -307,9 +324,15 @@ bool history_read(const char *given, size_t bytes, struct history *out, char *wh
     return true;
 }
 
-void history_free(struct history *history) {
+void history_changes_free(struct history *history) {
     for (size_t k = 0; k < history->n_changes; k++)
         cJSON_Delete(history->changes[k].patch);
     free(history->changes);
+    history->changes = NULL;
+    history->n_changes = 0;
+}
+
+void history_free(struct history *history) {
+    history_changes_free(history);
     *history = (struct history){0};
 }

@@ -48,8 +48,11 @@ struct history {
     struct history_change *changes;
     uint64_t epoch; // the newest one begun
 };
-// {"step", "time", "patch"} of a change, as the API tells it; takes the patch.
-cJSON *history_change_json(uint64_t step, double time, cJSON *patch);
+// {"revision", "step", "time", "patch"} of a change, as the API tells it; takes the patch.
+cJSON *history_change_json(uint64_t revision, uint64_t step, double time, cJSON *patch);
+// The same of a line of the event log; NULL when it tells of something else.
+cJSON *history_change_of(const char *line);
 // False when a line is no event; `why` (JOURNAL_WHY bytes) names it.
 bool history_read(const char *text, size_t bytes, struct history *out, char *why);
+void history_changes_free(struct history *history); // leaves the rest
 void history_free(struct history *history);

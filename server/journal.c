@@ -16,9 +16,13 @@
 #include <stdlib.h>
 #include <sys/file.h>
 #include <sys/stat.h>
+#include <sys/statvfs.h>
 #include <unistd.h>
 
 #include "server/journal_inside.h"
+
+#define ROOM_MIN ((uint64_t)1 << 20) // bytes: a small run's files and its first checkpoint
+#define FILES_MIN 16                 // a run's folder, its files, and those written beside them
 
 // ---- Helpers ----------------------------------------------------------------------------------
 
@@ -191,6 +195,24 @@ int journal_lock(const char *data_dir, char *why) {
         return -1;
     }
     return fd;
+}
+
+bool journal_has_room(const char *data_dir, char *why) {
+    char path[PATH_MAX];
+    struct statvfs disk;
+    snprintf(path, sizeof path, "%s/runs", data_dir);
+    if (access(path, R_OK | W_OK | X_OK) != 0 || statvfs(path, &disk) != 0) {
+        journal_failure(errno, path, why);
+        return false;
+    }
+    uint64_t room = (uint64_t)disk.f_bavail * disk.f_frsize;
+    // A file system that counts no files says 0 of 0.
+    if (room < ROOM_MIN || (disk.f_files > 0 && disk.f_favail < FILES_MIN)) {
+        journal_explain(why, "%.400s: %llu bytes and %llu files are left on the disk", path,
+                        (unsigned long long)room, (unsigned long long)disk.f_favail);
+        return false;
+    }
+    return true;
 }
 
 static int compare_text(const void *a, const void *b) {

@@ -89,7 +89,7 @@ static const struct {
      "ncelled\"]}"},
     {"Run", "{\"type\":\"object\",\"required\":[\"id\",\"state\",\"step\",\"time\",\"end_time\",\"p"
             "rogress\",\"eta_s\",\"dt\",\"fbar\",\"particles\",\"scene\",\"created\",\"error\",\"wa"
-            "rnings\",\"changes\",\"performance\",\"balance\",\"probes\",\"accuracy\"],"
+            "rnings\",\"revision\",\"changes\",\"performance\",\"balance\",\"probes\",\"accuracy\"],"
             "\"properties\":{\"id\":{"
             "\"type\":\"string\"},\"state\":{\"$ref\":\"#/components/schemas/State\"},\"step\":{\"t"
             "ype\":\"integer\"},\"time\":{\"$ref\":\"#/components/schemas/Number\"},\"end_time\":{"
@@ -98,11 +98,10 @@ static const struct {
             "f\":\"#/components/schemas/Number\"},\"fbar\":{\"type\":\"boolean\"},\"fbar_scheme\":{"
             "\"type\":\"string\"},\"particles\":{\"type\":\"integer\"},\"scene\":{\"type\":\"string"
             "\"},\"created\":{\"type\":\"string\"},\"error\":{\"type\":[\"object\",\"null\"]},\"war"
-            "nings\":{\"type\":\"array\",\"items\":{\"type\":\"string\"}},\"changes\":{\"type\":"
-            "\"array\",\"items\":{\"type\":\"object\",\"required\":[\"step\",\"time\",\"patch\"],"
-            "\"properties\":{\"step\":{\"type\":\"integer\"},\"time\":{\"$ref\":\"#/components/"
-            "schemas/"
-            "Number\"},\"patch\":{\"type\":\"object\"}}}},\"journal\":{\"type\":[\"object\","
+            "nings\":{\"type\":\"array\",\"items\":{\"type\":\"string\"}},\"revision\":{\"type\":"
+            "\"integer\",\"minimum\":0,\"description\":\"changes of the configuration so far\"},"
+            "\"changes\":{\"type\":\"array\",\"maxItems\":32,\"description\":\"the newest of them\","
+            "\"items\":{\"$ref\":\"#/components/schemas/Change\"}},\"journal\":{\"type\":[\"object\","
             "\"null\"]},\"recorders\":{\"type\":\"array\","
             "\"items\":{\"$ref\":\"#/components/schemas/Recorder\"}},\"performance\":{\"type\""
             ":\"object\",\"required\":[\"wall_s\",\"particle_steps_per_s\",\"bytes_per_particle\","
@@ -120,6 +119,13 @@ static const struct {
             "ay\",\"items\":{\"type\":\"object\",\"required\":[\"probe\",\"value\",\"reference\",\""
             "relative_error\",\"source\"]}},\"effective_step\":{\"type\":\"integer\"},\"frame_seq\""
             ":{\"type\":\"integer\"}}}"},
+    {"Change",
+     "{\"type\":\"object\",\"required\":[\"revision\",\"step\",\"time\",\"patch\"],\"properties\":{"
+     "\"revision\":{\"type\":\"integer\",\"minimum\":1},\"step\":{\"type\":\"integer\"},\"time\":{"
+     "\"$ref\":\"#/components/schemas/Number\"},\"patch\":{\"type\":\"object\"}}}"},
+    {"Changes",
+     "{\"type\":\"object\",\"required\":[\"changes\"],\"properties\":{\"changes\":{\"type\":"
+     "\"array\",\"items\":{\"$ref\":\"#/components/schemas/Change\"}}}}"},
     {"Text", "{\"type\":\"string\"}"},
     {"Runs",
      "{\"type\":\"object\",\"required\":[\"runs\"],\"properties\":{\"older\":{\"type\":\"integer"

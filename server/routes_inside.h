@@ -18,6 +18,7 @@ struct call {
 
 void routes_serve_action(struct call *c);
 void routes_serve_all_events(struct call *c);
+void routes_serve_changes(struct call *c);
 void routes_serve_config(struct call *c);
 void routes_serve_configure(struct call *c);
 void routes_serve_create(struct call *c);

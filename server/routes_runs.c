@@ -128,7 +128,12 @@ cJSON *routes_run_json(struct run *run) {
     warnings = cJSON_AddArrayToObject(json, "warnings");
     for (unsigned k = 0; k < status.n_warnings; k++)
         cJSON_AddItemToArray(warnings, cJSON_CreateString(status.warnings[k]));
-    cJSON_AddItemToObject(json, "changes", run_changes(run));
+    cJSON *changes = run_changes(run), *newest = NULL;
+    if (changes != NULL && changes->child != NULL)
+        newest = changes->child->prev; // the last one, with cJSON
+    reply_add(json, "revision",
+              newest != NULL ? json_member(newest, "revision")->valuedouble : 0);
+    cJSON_AddItemToObject(json, "changes", changes);
     cJSON_AddItemToObject(json, "journal", routes_journal_json(run));
     cJSON_AddItemToObject(json, "recorders", routes_recorders_json(run));
     cJSON_AddItemToObject(json, "performance", performance_json(&status));
@@ -506,13 +511,38 @@ void routes_serve_config(struct call *c) {
     run_release(run);
 }
 
+// All changes, which the run object has the newest of: read from the log, however many they are.
+void routes_serve_changes(struct call *c) {
+    uint64_t since;
+    if (!routes_query_number(c, "since_revision", 0, &since))
+        return;
+    struct run *run = routes_run_of(c);
+    if (run == NULL)
+        return;
+    struct journal *journal = run_journal(run);
+    cJSON *json = cJSON_CreateObject(), *list = cJSON_AddArrayToObject(json, "changes");
+    uint64_t offset = 0, revision = 0;
+    char *line;
+    while (journal != NULL && (line = journal_event_next(journal, &offset)) != NULL) {
+        cJSON *change = history_change_of(line);
+        if (change != NULL && ++revision > since)
+            cJSON_AddItemToArray(list, change);
+        else
+            cJSON_Delete(change);
+        free(line);
+    }
+    reply_json(c->reply, 200, json);
+    run_release(run);
+}
+
 // Whether one of the entity tags in an If-Match header is that of `revision`.
 static bool tag_matches(const char *header, uint64_t revision) {
     char tag[32];
     snprintf(tag, sizeof tag, "\"%llu\"", (unsigned long long)revision);
+    size_t n = strlen(tag);
     for (const char *at = header; at != NULL; at = strchr(at, ',')) {
         at += strspn(at, ", \t");
-        if (*at == '*' || strncmp(at, tag, strlen(tag)) == 0)
+        if (strncmp(at, tag, n) == 0 && strchr(", \t", at[n]) != NULL) // or the end
             return true;
     }
     return false;
@@ -525,7 +555,7 @@ void routes_serve_configure(struct call *c) {
     if (run == NULL)
         return;
     command.state = RUN_N_STATES;
-    if (match != NULL && strchr(match, '*') == NULL) {
+    if (match != NULL && strcmp(match, "*") != 0) {
         command.has_revision = true;
         command.revision = run_status(run).revision;
     }

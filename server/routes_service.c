@@ -15,8 +15,9 @@ void routes_serve_health(struct call *c) {
 }
 
 void routes_serve_ready(struct call *c) {
-    if (!runs_ready(c->routes->runs)) {
-        reply_problem(c->reply, 503, NULL, "no room for another run now");
+    char why[JOURNAL_WHY] = "";
+    if (!runs_ready(c->routes->runs, why)) {
+        reply_problem(c->reply, 503, NULL, "no room for another run now: %s", why);
         return;
     }
     cJSON *json = cJSON_CreateObject();

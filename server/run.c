@@ -590,8 +590,10 @@ static void restore_changes(struct run *r) {
             r->config = config;
         }
         const struct history_change *change = &r->history.changes[k];
-        cJSON_AddItemToArray(r->changes, history_change_json(change->step, change->time,
-                                                             cJSON_Duplicate(change->patch, true)));
+        if (k + RUN_CHANGES >= r->history.n_changes) // the newest
+            cJSON_AddItemToArray(r->changes,
+                                 history_change_json(k + 1, change->step, change->time,
+                                                     cJSON_Duplicate(change->patch, true)));
         faults_free(&faults);
     }
     r->now.revision = r->history.n_changes;
@@ -699,6 +701,7 @@ struct run *run_restore(const struct run_host *host, const char *id, enum run_re
     if (!live) {
         journal_rest(r->journal);
         series_rest(r->series);
+        history_free(&r->history);
     }
     if (r->meta.name == NULL)
         r->meta.name = strdup("");

@@ -186,7 +186,8 @@ const char *run_request(const struct run *run); // and the digest of that reques
 struct run_status run_status(struct run *run);
 char *run_scene_text(struct run *run);                      // JSON as run; the caller frees it
 char *run_config_text(struct run *run, uint64_t *revision); // the settable part of it
-cJSON *run_changes(struct run *run);              // [{step, time, patch}] of the configuration; new
+#define RUN_CHANGES 32 // of the configuration that a run object tells of: the newest
+cJSON *run_changes(struct run *run); // [{revision, step, time, patch}] of them; new
 struct series *run_series(struct run *run);       // NULL before there are probes
 struct journal *run_journal(struct run *run);     // NULL when its folder is damaged
 struct recorders *run_recorders(struct run *run); // likewise

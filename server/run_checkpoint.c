@@ -164,6 +164,7 @@ bool run_sim_begin(struct run *r) {
     if (r->next_seq < gone)
         r->next_seq = gone;
     r->metered = mpm_step_count(r->sim); // those of an earlier daemon are not this one's
+    run_changes_forget(r);
     run_schedule(r);
     if (!loaded)
         run_sample(r);

@@ -186,6 +186,15 @@ const struct history_change *run_change_due(const struct run *r) {
 
 void run_change_next(struct run *r) {
     change_repeat(r, &r->history.changes[r->replay.change++], &r->replay.scene);
+    run_changes_forget(r);
+}
+
+// Those that are made are in the log and, together, in the scene.
+void run_changes_forget(struct run *r) {
+    if (r->sim == NULL || r->replay.change < r->history.n_changes)
+        return;
+    history_changes_free(&r->history);
+    r->replay.change = 0;
 }
 
 // The scene as it was after the changes that the simulation has in it already.

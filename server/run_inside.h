@@ -127,6 +127,7 @@ void run_power(struct run *run); // the journal's durability as configured; warn
 enum run_outcome run_configure(struct run *run, struct run_command *command);
 const struct history_change *run_change_due(const struct run *run); // NULL when there is none
 void run_change_next(struct run *run);                              // makes it again
+void run_changes_forget(struct run *run); // once all are made again
 bool run_replay_scene(struct run *run);
 
 // ---- run_checkpoint.c

@@ -577,6 +577,7 @@ void *run_thread(void *argument) {
         cJSON_Delete(r->scene_json);
         cJSON_Delete(r->replay.scene);
         r->scene_json = r->replay.scene = NULL;
+        history_changes_free(&r->history);
     }
     atomic_store(&r->over, true);
     return NULL;

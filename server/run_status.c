@@ -170,10 +170,12 @@ static void remember_change(struct run *r, const cJSON *event) {
     const char *kind = cJSON_GetStringValue(json_member(event, "event"));
     if (kind == NULL || strcmp(kind, "config") != 0)
         return;
-    cJSON *change = history_change_json(r->now.step, r->now.time, // as in the event
+    cJSON *change = history_change_json(r->now.revision + 1, r->now.step, r->now.time, // as there
                                         cJSON_Duplicate(json_member(event, "patch"), true));
     pthread_mutex_lock(&r->lock);
     cJSON_AddItemToArray(r->changes, change);
+    if (cJSON_GetArraySize(r->changes) > RUN_CHANGES)
+        cJSON_DeleteItemFromArray(r->changes, 0);
     pthread_mutex_unlock(&r->lock);
 }
 

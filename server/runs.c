@@ -270,10 +270,9 @@ enum runs_removal runs_remove(struct runs *s, const char *id, enum run_state *st
     return result;
 }
 
-bool runs_ready(struct runs *s) {
-    char why[JOURNAL_WHY];
+bool runs_ready(struct runs *s, char *why) {
     pthread_mutex_lock(&s->lock);
     bool ready = admission(s, "", why) == RUNS_CREATED;
     pthread_mutex_unlock(&s->lock);
-    return ready;
+    return ready && journal_has_room(s->host->data_dir, why);
 }

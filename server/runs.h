@@ -34,4 +34,4 @@ struct run **runs_all(struct runs *runs, size_t *count);
 
 enum runs_removal { RUNS_REMOVED, RUNS_MISSING, RUNS_ALIVE, RUNS_REMOVAL_FAILED };
 enum runs_removal runs_remove(struct runs *runs, const char *id, enum run_state *state, char *why);
-bool runs_ready(struct runs *runs); // able to take a run
+bool runs_ready(struct runs *runs, char *why); // able to take a run; else `why` (JOURNAL_WHY bytes)

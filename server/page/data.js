@@ -35,7 +35,8 @@ export class RunData {
     this.samples = { step: [], time: [], columns: new Map() };
     this.scene = null;
     this.config = null;
-    this.changes = -1;
+    this.revision = -1;
+    this.changes = []; // of the configuration, all
     this.busy = null;
     this.next = null;
     this.stale = false;
@@ -45,7 +46,8 @@ export class RunData {
   forget() {
     this.frames = [];
     this.samples = { step: [], time: [], columns: new Map() };
-    this.changes = -1;
+    this.revision = -1;
+    this.changes = []; // of the configuration, all
     this.stale = true;
   }
 
@@ -75,11 +77,18 @@ export class RunData {
   }
 
   async syncScene(run) {
-    if (run.changes.length === this.changes) return;
-    const [scene, config] = await Promise.all([get(path(this.id, "/scene")), get(path(this.id, "/config"))]);
+    if (run.revision === this.revision) return;
+    const list = this.changes;
+    const [scene, config, { changes }] = await Promise.all([
+      get(path(this.id, "/scene")),
+      get(path(this.id, "/config")),
+      get(path(this.id, `/changes?since_revision=${list.at(-1)?.revision ?? 0}`)),
+    ]);
+    if (list !== this.changes) return;
     this.scene = scene;
     this.config = config;
-    this.changes = run.changes.length;
+    this.changes = [...list, ...changes];
+    this.revision = run.revision;
   }
 
   async syncFrames(run) {

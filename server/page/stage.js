@@ -129,7 +129,7 @@ function drawMarks() {
   const span = axis.at(-1) - axis[0];
   const list = [];
   for (const pane of panes)
-    for (const change of pane.run?.changes ?? []) if (change.patch.fbar !== undefined) list.push([place(change.time), JSON.stringify(change.patch.fbar)]);
+    for (const change of pane.data.changes) if (change.patch.fbar !== undefined) list.push([place(change.time), JSON.stringify(change.patch.fbar)]);
   const key = JSON.stringify([list, axis.length]);
   if (marks.dataset.list === key) return;
   marks.dataset.list = key;

@@ -19,7 +19,7 @@ ROUTES = {
     "/v1/runs/{id}:snapshot": {"post"}, "/v1/runs/{id}/config": {"get", "patch"}, "/v1/runs/{id}/scene": {"get"},
     "/v1/runs/{id}/probes": {"get"}, "/v1/runs/{id}/frames": {"get"}, "/v1/runs/{id}/frames/{seq}": {"get"},
     "/v1/runs/{id}/events": {"get"}, "/v1/runs/{id}/stream": {"get"}, "/metrics": {"get"},
-    "/": {"get"}, "/page/{file}": {"get"}, "/v1/events": {"get"}, "/v1/runs/{id}/recorders": {"get"}, "/v1/runs/{id}/recorders/{name}": {"put", "delete"},
+    "/": {"get"}, "/page/{file}": {"get"}, "/v1/events": {"get"}, "/v1/runs/{id}/changes": {"get"}, "/v1/runs/{id}/recorders": {"get"}, "/v1/runs/{id}/recorders/{name}": {"put", "delete"},
 }  # fmt: skip
 METHODS = ("get", "post", "put", "patch", "delete", "head", "options", "trace")
 

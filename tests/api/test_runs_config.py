@@ -265,6 +265,54 @@ def test_run_tells_its_changes_also_after_a_restart(tmp_path):
         d.stop()
 
 
+def test_changes_however_many_leave_the_run_object_small(fresh):
+    """The object has the newest 32, their route has all; over a restart too, with what they made of the run."""
+    d = fresh().start()
+    d.create(endless(), id="r", start=False)
+    d.create(endless(), id="early", start=False)
+    before = len(d.ask("GET", "/v1/runs/r").body)
+    for k in range(1, 101):
+        d.act("r", "step", {"steps": 1})
+        d.wait("r", "paused")
+        assert d.patch("r", {"damping": {"mass": 0.001 * k}})["effective_step"] == k
+    assert d.get("/v1/runs/early/changes") == {"changes": []}
+
+    def check():
+        run, every = d.run("r"), d.get("/v1/runs/r/changes")["changes"]
+        assert [c["revision"] for c in every] == list(range(1, 101))
+        assert [c["step"] for c in every] == list(range(1, 101))
+        assert [c["patch"]["damping"]["mass"] for c in every] == [0.001 * k for k in range(1, 101)]
+        assert run["revision"] == 100 and run["changes"] == every[-32:]
+        assert len(d.ask("GET", "/v1/runs/r").body) < before + 32 * 100
+        assert d.ask("GET", "/v1/runs/r/config").headers["etag"] == '"100"'
+        assert d.get("/v1/runs/r/config")["damping"]["mass"] == 0.1
+        assert d.get("/v1/runs/r/changes?since_revision=98")["changes"] == every[98:]
+        assert d.get("/v1/runs/r/changes?since_revision=1000000000000")["changes"] == []
+
+    check()
+    d.kill()
+    d.start()
+    check()
+    d.act("r", "step", {"steps": 5})  # makes those again that came after the last checkpoint
+    assert d.wait("r", "paused")["step"] == 105
+    check()
+    d.act("r", "cancel")
+    d.stop()
+    d.start()
+    check()
+    d.ask("GET", "/v1/runs/r/changes?since_revision=-1", status=400)
+    d.ask("GET", "/v1/runs/nobody/changes", status=404)
+    d.away("r", "early")
+
+
+def test_if_match_is_a_list_of_tags_and_nothing_near_them(daemon, live):
+    path = f"/v1/runs/{live}/config"
+    tag = daemon.ask("GET", path).headers["etag"]
+    for header in (f"{tag}x", f'W/{tag}', tag.strip('"'), '"*"', '"a*"', f'{tag[:-1]}0"', "", ","):
+        daemon.ask("PATCH", path, {"damping": {"mass": 7}}, {"If-Match": header}, status=412)
+    daemon.ask("PATCH", path, {"damping": {"mass": 7}}, {"If-Match": f'"x" , {tag}'})
+
+
 def test_dt_on_a_cfl_run_is_a_fault_of_the_patch(daemon, name):
     scene = endless(time={"dt": None, "cfl": 0.2})
     daemon.create(scene, id=name, start=False)

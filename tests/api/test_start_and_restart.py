@@ -209,6 +209,43 @@ def test_tls_serves_https(tmp_path):
         d.stop()
 
 
+def test_not_ready_without_the_data_folder(fresh):
+    d = fresh().start()
+    d.ask("GET", "/readyz")
+    away = d.data.with_name("away")
+    d.data.rename(away)
+    reply = d.ask("GET", "/readyz", status=503)
+    assert f"{d.data}/runs: No such file" in reply.json["detail"], reply
+    d.ask("POST", "/v1/runs", {"scene": endless()}, status=507)  # as it foretold
+    d.ask("GET", "/healthz")
+    away.rename(d.data)
+    d.ask("GET", "/readyz")
+    d.away(d.create(endless())["id"])
+
+
+def test_not_ready_where_the_disk_is_full(fresh):
+    d = fresh()
+    d.data.mkdir()
+
+    def mount(options):
+        return subprocess.run(["mount", "-t", "tmpfs", "-o", options, "tmpfs", d.data], capture_output=True).returncode
+
+    if mount("size=512k"):
+        pytest.skip("cannot mount a small tmpfs here")
+    try:
+        d.start()
+        assert "bytes and" in d.ask("GET", "/readyz", status=503).json["detail"]
+        mount("remount,size=16m")
+        d.ask("GET", "/readyz")
+        mount("remount,nr_inodes=8")
+        assert "files are left" in d.ask("GET", "/readyz", status=503).json["detail"]
+        mount("remount,nr_inodes=100")
+        d.ask("GET", "/readyz")
+        d.stop()
+    finally:
+        subprocess.run(["umount", "-l", d.data])
+
+
 def test_queue_that_is_full_is_503_and_not_ready(fresh):
     d = fresh("--queue", "1", slots=1).start()
     first, second = (d.create(endless())["id"] for _ in range(2))

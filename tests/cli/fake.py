@@ -94,6 +94,7 @@ class Fake:
             f"{100 * i},{0.01 * i!r},{4 + 0.01 * i!r},{7 * i},{i},{'' if i == 1 else -i}\r\n"
             for i in range(n_frames))
         self.changes = [{"step": 500, "time": 0.05, "patch": {"fbar": False}}]
+        self.changes_path = True  # else they are in the run object alone, as with earlier daemons
         self.scene = {"title": "Fake", "dimension": 2, "gravity": [0, -9.81], "probes": {
             "front": {"kind": "extent", "axis": "x", "side": "max", "body": "water"},
             "force": {"kind": "reaction", "wall": "floor"}}}
@@ -201,7 +202,7 @@ class Fake:
                 "particles": last["count"], "error": None, "warnings": [],
                 "performance": {"wall_s": 1.0, "particle_steps_per_s": 1e6, "threads": 2},
                 "balance": {"mass": 1.0}, "probes": last["probes"], "accuracy": [],
-                "changes": self.changes}
+                "changes": self.changes[-1:] if self.changes_path else self.changes}
 
     def route(self, method, path, body, headers):
         self.requests.append((method, path))
@@ -241,6 +242,8 @@ class Fake:
             return (204, "application/json", b"") if method == "DELETE" else ok(self.run_object())
         if path == base + "/scene":
             return ok(self.scene)
+        if path == base + "/changes" and self.changes_path:
+            return ok({"changes": self.changes})
         if path.startswith(base + "/probes"):
             return 200, "text/csv", self.probes_csv.encode()
         if path == base + "/frames":

@@ -69,6 +69,18 @@ def test_record_live_run_holds_every_value(fbar, fake, start_fbar, tmp_path):
         assert json.loads(about["changes/patch"][0]) == {"fbar": False}
 
 
+@pytest.mark.parametrize("path", [True, False], ids=["all at their path", "all in the run object"])
+def test_record_takes_all_changes_of_daemons_old_and_new(fbar, fake, tmp_path, path):
+    daemon = fake(n_frames=2)
+    daemon.changes = [{"revision": k, "step": k, "time": 1e-4 * k, "patch": {"fbar": k % 2 == 0}} for k in range(1, 41)]
+    daemon.changes_path = path  # then the run object has the newest alone
+    daemon.advance(2, live=False)
+    assert fbar("record", "r1", "-o", "a.h5", url=daemon.url).returncode == 0
+    with h5py.File(tmp_path / "a.h5") as f:
+        assert list(f["fbard/changes/step"]) == list(range(1, 41))
+        assert [json.loads(p)["fbar"] for p in f["fbard/changes/patch"]] == [k % 2 == 0 for k in range(1, 41)]
+
+
 def test_record_3d_tensors_and_integers(fbar, fake, tmp_path):
     daemon = fake(n_frames=4, dimension=3, count=27)
     daemon.advance(4, live=False)
