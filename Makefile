@@ -82,7 +82,7 @@ $(call levels,$(LANES_SRC)): ALL_CFLAGS += $(LANES_FLAGS)
 .PHONY: studies all programs deps deps-page deps-long deps-report libmpm demo report report-page report-docs check check-all check-layers check-unit \
 	check-physics check-api check-page \
 	check-cli check-loss check-hard check-asan check-clang check-fuzz check-tsan unit-programs check-long bench bench-solver bench-peer \
-	bench-recording bench-status bench-threads fuzz install uninstall format clean help
+	bench-recording bench-page bench-status bench-threads fuzz install uninstall format clean help
 .DELETE_ON_ERROR:
 .SECONDARY:
 
@@ -318,6 +318,9 @@ bench-recording: all ## what journal and recording cost a run, and how fast fbar
 
 bench-threads: all ## what a second thread is worth to runs of several sizes, on free and on busy cores
 	$(Q)FBARD=$(CURDIR)/$(B)/fbard $(PYTHON) bench/threads.py
+
+bench-page: all $(PAGE_MODULES)/.installed ## the live page with a million particles
+	$(Q)FBARD=$(CURDIR)/$(B)/fbard PAGE_MODULES=$(CURDIR)/build/page node bench/page.mjs
 
 bench-status: all ## how fast the daemon answers while a run uses all cores, and what that costs the run
 	$(Q)FBARD=$(CURDIR)/$(B)/fbard $(PYTHON) bench/status.py

@@ -1,4 +1,7 @@
-// Frames for viewers: every k-th particle, some of the fields, in the same format.
+// Frames for viewers: one of every k particles, some of the fields, in the same format.
+//
+// Bodies are seeded row by row, so that every k-th particle of theirs stands in stripes, which look like something that
+// is in the flow. So it is one at a random place in each group of k: the same one in every frame.
 #include "server/thin.h"
 
 #include <stdlib.h>
@@ -17,7 +20,7 @@ static bool wanted(const struct thin *thin, const cJSON *field) {
     return thin->fields == 0 || (number >= 0 && (thin->fields >> number & 1) != 0);
 }
 
-// Header of a frame -> plan of the same frame with every `stride`-th particle. The plan borrows
+// Header of a frame -> plan of the same frame with one particle of every `stride`. The plan borrows
 // from the JSON and from `probes`.
 static bool thin_plan(const struct thin *thin, const cJSON *header, size_t stride, char *probes,
                       struct frame_plan *out) {
@@ -51,6 +54,16 @@ static bool thin_plan(const struct thin *thin, const cJSON *header, size_t strid
     return frame_layout(out) == 0;
 }
 
+// The particle that stands for the group-th `stride` particles of `count`.
+static size_t thin_pick(size_t group, size_t stride, size_t count) {
+    const size_t first = group * stride, left = count - first;
+    uint64_t h = group; // SplitMix64's mixing (Steele, Lea, Flood 2014)
+    h = (h ^ h >> 30) * 0xbf58476d1ce4e5b9u;
+    h = (h ^ h >> 27) * 0x94d049bb133111ebu;
+    h ^= h >> 31;
+    return first + (size_t)(h % (left < stride ? left : stride));
+}
+
 unsigned char *thin_frame(const struct thin *thin, const void *frame, size_t frame_bytes,
                           size_t *bytes) {
     struct faults faults = {0};
@@ -79,7 +92,8 @@ unsigned char *thin_frame(const struct thin *thin, const void *frame, size_t fra
                 (const unsigned char *)frame + (size_t)json_member(field, "offset")->valuedouble;
             size_t row = plan.count > 0 ? plan.fields[k].bytes / plan.count : 0;
             for (size_t p = 0; p < plan.count; p++)
-                memcpy(out + plan.fields[k].offset + p * row, from + p * stride * row, row);
+                memcpy(out + plan.fields[k].offset + p * row,
+                       from + thin_pick(p, stride, count) * row, row);
             k++;
         }
         frame_seal(out);

@@ -1,11 +1,11 @@
-// Frames for viewers: every k-th particle, some of the fields, in the same format.
+// Frames for viewers: one of every k particles, some of the fields, in the same format.
 #pragma once
 #include <stdbool.h>
 #include <stddef.h>
 #include <stdint.h>
 
 struct thin {
-    size_t max_particles; // 0: all; else every k-th with the smallest k that leaves at most these
+    size_t max_particles; // 0: all; else one of k, with the smallest k that leaves at most these
     uint32_t fields;      // bits by enum mpm_field; 0: all
 };
 bool thin_asked(const struct thin *thin);

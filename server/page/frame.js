@@ -24,14 +24,35 @@ export function parse(buffer) {
   return { header, fields, count: header.count, dimension: header.dimension };
 }
 
+// Particles go to the graphics processor shuffled, so that every beginning of them is spread over all, without the
+// stripes of the rows in which they were seeded, and a view in motion may draw a part. The same shuffle for one number of
+// particles, kept (a frame is the like of the one before): those that are left out stay out.
+const shuffles = new Map();
+function shuffled(n) {
+  let order = shuffles.get(n);
+  if (order === undefined) {
+    order = Uint32Array.from({ length: n }, (_, p) => p);
+    let seed = 1;
+    for (let p = n - 1; p > 0; p--) {
+      seed = (Math.imul(seed, 1664525) + 1013904223) >>> 0; // Numerical Recipes' generator: its high bits are good enough
+      const q = Math.floor((seed / 4294967296) * (p + 1));
+      [order[p], order[q]] = [order[q], order[p]];
+    }
+    if (shuffles.size > 3) shuffles.delete(shuffles.keys().next().value);
+    shuffles.set(n, order);
+  }
+  return order;
+}
+
 // Positions as x, y, z of every particle, for the graphics processor.
 export function positions(frame) {
   const from = frame.fields.get("position");
   const out = new Float32Array(3 * frame.count);
   if (from === undefined) return out;
   const d = from.width;
+  const order = shuffled(frame.count);
   for (let p = 0; p < frame.count; p++)
-    for (let k = 0; k < d; k++) out[3 * p + k] = from.values[d * p + k];
+    for (let k = 0; k < d; k++) out[3 * p + k] = from.values[d * order[p] + k];
   return out;
 }
 
@@ -72,22 +93,23 @@ export function choices(names, dimension) {
   return list;
 }
 
-// The values of a choice, one a particle, and their unit; null when the frame does not have the field.
+// The values of a choice, one a particle in the order of `positions`, and their unit; null when the frame does not have the field.
 export function values(frame, choice) {
   const from = frame.fields.get(choice.field);
   if (from === undefined) return null;
   const out = new Float32Array(frame.count);
   const w = from.width;
   const v = from.values;
+  const order = shuffled(frame.count);
   if (choice.part === "size") {
     for (let p = 0; p < frame.count; p++) {
       let sum = 0;
-      for (let d = 0; d < w; d++) sum += v[w * p + d] ** 2;
+      for (let d = 0; d < w; d++) sum += v[w * order[p] + d] ** 2;
       out[p] = Math.sqrt(sum);
     }
   } else {
     const offset = Number(choice.part ?? 0);
-    for (let p = 0; p < frame.count; p++) out[p] = v[w * p + offset];
+    for (let p = 0; p < frame.count; p++) out[p] = v[w * order[p] + offset];
   }
   return { values: out, unit: from.unit };
 }

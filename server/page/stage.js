@@ -8,6 +8,7 @@ import { byId, color, h, isDark, number, options, save, say, scaled, toast } fro
 import { Camera, View } from "./view.js";
 
 const PLAY_MS = 60; // between two frames that are played
+const PATIENT_MS = 30; // that a frame may take the page without being noticed
 const BOX = 8; // corners
 
 const camera = new Camera();
@@ -202,6 +203,9 @@ export function stopFollowing() {
   follower = null;
 }
 
+// When the browser has shown what was asked for last; in a hidden tab at once.
+const drawn = () => new Promise((done) => (document.hidden ? done() : requestAnimationFrame(() => setTimeout(done))));
+
 async function startFollowing(pane) {
   const mine = { abort: new AbortController() };
   const { most, field } = { most: setting.most, field: setting.field.field };
@@ -211,9 +215,14 @@ async function startFollowing(pane) {
       if (follower !== mine || !panes.includes(pane)) return;
       const frame = pane.data.keep(buffer, most, field);
       pane.followed = true;
+      const began = performance.now();
       accept(pane, frame);
       time = frame.header.time;
       tell();
+      await drawn();
+      // Frames may take the page half of its time; what is not read the daemon leaves out.
+      const took = performance.now() - began;
+      if (took > PATIENT_MS) await new Promise((done) => setTimeout(done, Math.min(took, 1000)));
     }
   } catch {
     // gone: the next event of the run, or the return of the daemon, brings it back
@@ -289,7 +298,9 @@ function upload(pane) {
     pane.removed = now;
     pane.view.strokesOf(walls(pane));
   }
-  const size = Math.SQRT2 * setting.size * spacing(pane); // the diagonal: discs leave no gaps
+  // The diagonal: discs leave no gaps; and some more where a part of the particles is there, which are no lattice.
+  const part = frame.count < (pane.run?.particles ?? 0);
+  const size = (part ? 1.25 : 1) * Math.SQRT2 * setting.size * spacing(pane);
   view.particles(p, frame.dimension, size);
   if (first || !camera.touched) fitIfOutside(first);
 }

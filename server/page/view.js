@@ -50,6 +50,13 @@ void main() { color = ink; }`;
 
 const FIELD_OF_VIEW = (30 * Math.PI) / 180;
 
+// What a picture of all particles would take longer than this, shows a part of them as long as the view moves or frames
+// come: without a graphics processor 200,000 particles take some 100 ms, in which the page would not answer.
+const SMOOTH_MS = 40;
+const LEAST_PARTICLES = 5000; // fewer are no picture any more
+const SETTLE_MS = 200; // of rest, then all are drawn
+const SETTLE_SHARE = 4; // and at least so many times what all of them take: the page must answer in between
+
 function program(gl, vertex, fragment) {
   const p = gl.createProgram();
   for (const [kind, text] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
@@ -180,6 +187,8 @@ export class View {
     this.background = [1, 1, 1, 1];
     this.ink = [0, 0, 0, 1];
     this.pending = false;
+    this.pace = 0; // ms that a particle takes to draw, as last measured
+    this.settling = 0; // timer: then all are drawn
     this.setUp();
     canvas.addEventListener("webglcontextlost", (event) => event.preventDefault());
     canvas.addEventListener("webglcontextrestored", () => {
@@ -211,6 +220,7 @@ export class View {
   }
 
   close() {
+    clearTimeout(this.settling);
     this.watcher.disconnect();
     this.camera.listeners.delete(this.redraw);
     this.gl?.getExtension("WEBGL_lose_context")?.loseContext();
@@ -261,13 +271,31 @@ export class View {
   request() {
     if (this.pending) return;
     this.pending = true;
-    requestAnimationFrame(() => this.draw());
+    requestAnimationFrame(() => this.hurry());
   }
 
-  draw() {
+  // Draws as many particles as SMOOTH_MS allow, and the rest once it is quiet.
+  hurry() {
+    clearTimeout(this.settling);
+    const all = this.pace * this.count;
+    const part = all > SMOOTH_MS ? Math.max(LEAST_PARTICLES, Math.floor(SMOOTH_MS / this.pace)) : this.count;
+    this.draw(Math.min(part, this.count));
+    if (part < this.count) this.settling = setTimeout(() => requestAnimationFrame(() => this.draw()), Math.max(SETTLE_MS, SETTLE_SHARE * all));
+  }
+
+  // The next picture of the browser comes when this one is done.
+  measure(began, count) {
+    requestAnimationFrame(() => {
+      if (document.hidden || count < LEAST_PARTICLES) return;
+      this.pace = Math.max(0, performance.now() - began - 1000 / 60) / count;
+    });
+  }
+
+  draw(count = this.count) {
     this.pending = false;
     const gl = this.gl;
     if (gl === null || gl.isContextLost()) return;
+    this.measure(performance.now(), count);
     const dense = Math.min(window.devicePixelRatio || 1, 2);
     const width = Math.max(1, Math.round(this.canvas.clientWidth * dense));
     const height = Math.max(1, Math.round(this.canvas.clientHeight * dense));
@@ -294,12 +322,13 @@ export class View {
       gl.vertexAttribPointer(0, 3, gl.FLOAT, false, 0, 0);
       gl.drawArrays(gl.LINES, 0, this.lines);
     }
-    if (this.count > 0) {
+    if (count > 0) {
       gl.useProgram(this.points);
       gl.uniformMatrix4fv(this.uniforms.transform, false, transform);
       const perMetre = height / (2 * this.camera.half); // at the target
       const depth = flat ? 1 : this.camera.half / Math.tan(FIELD_OF_VIEW / 2);
-      gl.uniform1f(this.uniforms.pixels, this.size * perMetre * depth);
+      const wider = count === this.count ? 1 : 1.25 * (this.count / count) ** (1 / this.dimension); // a part of them, in no lattice, covers what all do
+      gl.uniform1f(this.uniforms.pixels, wider * this.size * perMetre * depth);
       gl.uniform2f(this.uniforms.range, ...this.range);
       gl.uniform1f(this.uniforms.flat2d, flat ? 1 : 0);
       gl.activeTexture(gl.TEXTURE0);
@@ -311,7 +340,7 @@ export class View {
       gl.bindBuffer(gl.ARRAY_BUFFER, this.buffers.value);
       gl.enableVertexAttribArray(1);
       gl.vertexAttribPointer(1, 1, gl.FLOAT, false, 0, 0);
-      gl.drawArrays(gl.POINTS, 0, this.count);
+      gl.drawArrays(gl.POINTS, 0, count);
     }
     this.ondrawn?.();
   }

@@ -52,3 +52,16 @@ class Frame:
 
     def __getitem__(self, name):
         return self.fields[name]
+
+
+def picked(cut, whole, stride):
+    """The rows of `whole` that `cut` has: one of every `stride`, the same for all fields."""
+    assert cut.header["count"] == -(-whole.header["count"] // stride)
+    rows = []
+    for g in range(cut.header["count"]):
+        group = slice(g * stride, (g + 1) * stride)
+        same = np.all([np.all(whole[name][group].reshape(len(whole[name][group]), -1) == cut[name][g].ravel(), axis=1)
+                       for name in cut.fields], axis=0)  # fmt: skip
+        assert same.any(), g
+        rows.append(g * stride + int(np.argmax(same)))
+    return rows

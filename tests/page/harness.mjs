@@ -97,9 +97,11 @@ export async function launch() {
 }
 
 // A page under watch. `watch.foretold` are patterns of what may be on the console now.
-export async function open(browser, url, options = {}) {
+// `script` runs in it before its own.
+export async function open(browser, url, options = {}, script = null) {
   const context = await browser.newContext({ viewport: { width: 1280, height: 800 }, reducedMotion: "reduce", ...options });
   const page = await context.newPage();
+  if (script !== null) await page.addInitScript(script);
   page.setDefaultTimeout(PATIENCE_MS);
   const watch = { page, context, foretold: [], wrong: [], requests: [] };
   page.on("console", (message) => {
@@ -119,7 +121,8 @@ export async function open(browser, url, options = {}) {
 }
 
 // What a picture shows: {share} of pixels that are not background, {saturated} of those with a hue,
-// {colors} told apart in steps of 16, {darkest, lightest} of those that are not background (relative luminance, 0..255), {background}.
+// {colors} told apart in steps of 16, {darkest, lightest} of those that are not background (relative luminance, 0..255), {background},
+// {place}: the middle of those with a hue, px.
 export async function look(browser, png) {
   const page = (look.page ??= await browser.newPage()); // of its own, without the policy of ours
   return page.evaluate(async (data) => {
@@ -131,15 +134,19 @@ export async function look(browser, png) {
     const light = (k) => 0.2126 * p[k] + 0.7152 * p[k + 1] + 0.0722 * p[k + 2];
     const corner = 4 * (image.width * 3 + image.width - 4); // no frame, no text there
     const seen = new Set();
-    let [n, colorful, darkest, lightest] = [0, 0, 255, 0];
+    let [n, colorful, darkest, lightest, sumX, sumY] = [0, 0, 255, 0, 0, 0];
     for (let k = 0; k < p.length; k += 4) {
       if (Math.abs(p[k] - p[corner]) + Math.abs(p[k + 1] - p[corner + 1]) + Math.abs(p[k + 2] - p[corner + 2]) < 12) continue;
       n++;
-      colorful += Math.max(p[k], p[k + 1], p[k + 2]) - Math.min(p[k], p[k + 1], p[k + 2]) > 48;
+      if (Math.max(p[k], p[k + 1], p[k + 2]) - Math.min(p[k], p[k + 1], p[k + 2]) > 48) {
+        colorful++;
+        sumX += (k / 4) % image.width;
+        sumY += Math.floor(k / 4 / image.width);
+      }
       seen.add(((p[k] >> 4) << 8) | ((p[k + 1] >> 4) << 4) | (p[k + 2] >> 4));
       darkest = Math.min(darkest, light(k));
       lightest = Math.max(lightest, light(k));
     }
-    return { width: image.width, height: image.height, share: (4 * n) / p.length, saturated: (4 * colorful) / p.length, colors: seen.size, darkest, lightest, background: light(corner) };
+    return { width: image.width, height: image.height, share: (4 * n) / p.length, saturated: (4 * colorful) / p.length, colors: seen.size, darkest, lightest, background: light(corner), place: [sumX / colorful, sumY / colorful] };
   }, png.toString("base64"));
 }

@@ -91,6 +91,42 @@ check("a file's faults are listed with their pointers", async () => {
   await says("#create .faults", /\/scene\/spped.*\/scene\/materials|\/scene\/materials.*\/scene\/spped/s);
 });
 
+check("a scene file is dropped on the page", async () => {
+  watch.foretold = [/status of 422/, /status of 400/];
+  await page.keyboard.press("Escape");
+  const drop = async (name, content) => {
+    const dataTransfer = await page.evaluateHandle(([n, c]) => {
+      const data = new DataTransfer();
+      data.items.add(new File([c], n, { type: "application/json" }));
+      return data;
+    }, [name, content]);
+    await page.dispatchEvent("#welcome", "dragenter", { dataTransfer });
+    await page.getByText("Drop a scene file (JSON)").waitFor();
+    await page.dispatchEvent("#welcome", "drop", { dataTransfer });
+    await page.getByText("Drop a scene file (JSON)").waitFor({ state: "hidden" });
+    await page.getByRole("heading", { name: "New run" }).waitFor();
+  };
+  const scene = await daemon.get("/v1/scenes/dam-break");
+  await drop("wrong.json", JSON.stringify({ ...scene, cell: -1, spped: 3 }));
+  await says("#create-cell-fault", /must be a number > 0 in m, got -1/); // at its field, as the daemon words it
+  await says("#create .faults", /\/scene\/spped/);
+  await page.keyboard.press("Escape");
+  await drop("mine.json", JSON.stringify({ ...scene, title: "My own", cell: 0.5 }));
+  await says("#create .about", /^My own$/);
+  await says("#create .estimate", /800 particles/);
+  await page.getByLabel("Name of the run").fill("dropped");
+  await page.getByLabel("start at once").uncheck();
+  await page.getByRole("button", { name: "Create", exact: true }).click();
+  await says("#run-title", /^dropped$/);
+  const run = await daemon.get("/v1/runs/dropped");
+  assert.deepEqual([run.scene, run.state, run.particles], ["My own", "paused", 800]);
+  watch.foretold.push(/status of 404/); // what the page still asks for when somebody else deletes the run
+  await daemon.ask("POST", "/v1/runs/dropped:cancel");
+  await daemon.ask("DELETE", "/v1/runs/dropped");
+  await page.getByRole("heading", { name: "Nothing is selected" }).waitFor();
+  await page.keyboard.press("n");
+});
+
 check("a run is created from a built-in scene with overrides", async () => {
   await page.getByLabel("Scene", { exact: true }).selectOption("dam-break");
   await page.getByLabel("Name of the run").fill(RUN);
@@ -380,6 +416,54 @@ test("three dimensions are orbited", async () => {
   let turned;
   await until("another picture", async () => !(turned = await canvas.screenshot()).equals(before));
   assert.ok((await look(browser, turned)).share > 0.05);
+  assert.deepEqual(own.wrong, []);
+  await own.context.close();
+});
+
+test("fingers on a phone: one orbits, two pan, a pinch zooms", async () => {
+  const own = await open(browser, `${daemon.url}/#run=solid`, { viewport: { width: 390, height: 844 }, hasTouch: true, isMobile: true });
+  const canvas = own.page.locator("canvas.particles");
+  await own.page.locator(".pane-title b").waitFor();
+  await canvas.scrollIntoViewIfNeeded();
+  const box = await canvas.boundingBox();
+  const [x, y] = [box.x + box.width / 2, box.y + box.height / 2];
+  const cdp = await own.context.newCDPSession(own.page);
+  const touch = (type, ...points) => cdp.send("Input.dispatchTouchEvent", { type, touchPoints: points.map(([px, py], id) => ({ x: px, y: py, id })) });
+  const slide = async (from, to) => {
+    await touch("touchStart", ...from);
+    for (let k = 1; k <= 4; k++) await touch("touchMove", ...from.map((p, f) => p.map((v, d) => v + (k / 4) * (to[f][d] - v))));
+    await touch("touchEnd");
+  };
+  // What the view shows: {perMetre: px by its scale; place: of the particles, px}.
+  let shot = null;
+  const view = async () => {
+    shot = await canvas.screenshot();
+    const [width, label] = [(await own.page.locator(".scale i").boundingBox()).width, await own.page.locator(".scale span").textContent()];
+    return { perMetre: width / Number(label.replace(" m", "")), place: (await look(browser, shot)).place };
+  };
+  // The view, once it is nearer by `zoom`, and the particles have moved by `by` px (12 for what perspective makes of it).
+  const becomes = (what, from, zoom, by) => {
+    let now = null;
+    return until(() => `${what}: ${JSON.stringify([from, now])}`, async () => {
+      now = await view();
+      return Math.abs(now.perMetre / from.perMetre / zoom - 1) < 0.02 && by.every((v, d) => v === null || Math.abs(now.place[d] - from.place[d] - v) < 12) && now;
+    });
+  };
+  const scrolled = () => own.page.evaluate(() => document.scrollingElement.scrollTop);
+  const top = await scrolled();
+  await own.page.locator("#field").selectOption("position:0"); // in all colours
+  await own.page.locator(".legend").evaluate((legend) => (legend.style.visibility = "hidden")); // whose colours stay where they are
+  await until("particles", async () => (await view()).place.every((v) => v > 0));
+  const start = await view();
+  const before = shot;
+  await slide([[x, y]], [[x + 90, y + 20]]);
+  await until("another side", async () => !(await view(), shot.equals(before)));
+  const orbited = await becomes("turned about its middle", start, 1, [0, null]);
+  await slide([[x - 40, y], [x + 40, y]], [[x + 10, y - 30], [x + 90, y - 30]]);
+  const panned = await becomes("moved with the fingers", orbited, 1, [50, -30]);
+  await slide([[x - 40, y], [x + 40, y]], [[x - 80, y], [x + 80, y]]);
+  await becomes("twice as near", panned, 2, [null, null]);
+  assert.equal(await scrolled(), top, "the page stays where it is");
   assert.deepEqual(own.wrong, []);
   await own.context.close();
 });
