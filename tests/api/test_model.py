@@ -198,13 +198,15 @@ class Model(RuleBasedStateMachine):
         assert not run.states == {"failed"}
         run.steps = now["step"]
 
-    @rule(run=runs, what=st.sampled_from(["scene", "probes", "frames", "recorders", "config", "frames/latest",
+    @rule(run=runs, what=st.sampled_from(["scene", "probes", "frames", "recorders", "config", "changes", "frames/latest",
                                           "probes?since_step=5"]))  # fmt: skip
     def read(self, run, what):
         reply = service.ask("GET", f"/v1/runs/{run.name}/{what}")
         assert reply.status == 200 or (what == "frames/latest" and reply.status == 404), reply
         if what == "recorders":
             assert {r["name"] for r in reply.json["recorders"]} == run.recorders
+        if what == "changes":
+            assert [c["revision"] for c in reply.json["changes"]] == list(range(1, int(run.etag.strip('"')) + 1))
         if what == "config":
             assert reply.headers["etag"] == run.etag
             for key, value in run.config.items():

@@ -45,7 +45,7 @@ def client(daemon, runs, seed, end):
     while time.monotonic() < end or asked < 5:
         run, what = random_.choice(runs), random_.randrange(12)
         if what < 3:
-            reply = daemon.request("GET", f"/v1/runs/{run}" + random_.choice(["", "/config", "/probes", "/frames/latest"]))
+            reply = daemon.request("GET", f"/v1/runs/{run}" + random_.choice(["", "/config", "/changes", "/probes", "/frames/latest"]))
         elif what < 6:
             patch = random_.choice([{"fbar": True}, {"fbar": False}, {"damping": {"mass": random_.random()}},
                                     {"time": {"dt": 5e-4 + 5e-4 * random_.random()}}])  # fmt: skip
@@ -56,7 +56,7 @@ def client(daemon, runs, seed, end):
             reply = daemon.request("PUT", f"/v1/runs/{run}/recorders/c{seed}", {"acked": -1})
             daemon.request("DELETE", f"/v1/runs/{run}/recorders/c{seed}")
         elif what < 10:
-            reply = daemon.request("GET", random_.choice(["/metrics", "/v1/runs", "/v1"]))
+            reply = daemon.request("GET", random_.choice(["/metrics", "/v1/runs", "/v1", "/readyz"]))
         else:
             own = f"c{seed}x{asked}"
             reply = daemon.request("POST", "/v1/runs", {"scene": water(time={"end": 0.01}), "id": own})
