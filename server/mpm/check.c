@@ -313,6 +313,7 @@ static void check_shape(struct report *r, const struct mpm_shape *shape, const c
 struct outside {
     const struct mpm_def *def;
     const struct mpm_shape *other;
+    struct mpm_region *region; // the same, made ready; NULL without memory
     size_t out_of_domain, beyond_wall, in_other, bad_volume;
     int wall;
     double unit;
@@ -368,7 +369,8 @@ static bool look_at(void *context, const double *x, double volume) {
 static bool look_in_other(void *context, const double *x, double volume) {
     (void)volume;
     struct outside *o = context;
-    o->in_other += mpm_shape_contains(o->other, x, o->def->dimension, o->unit);
+    o->in_other += o->region ? mpm_region_contains(o->region, x)
+                             : mpm_shape_contains(o->other, x, o->def->dimension, o->unit);
     return true;
 }
 
@@ -449,7 +451,9 @@ static bool check_body(struct report *r, const struct mpm_def *def, size_t b, do
         o.other = &def->bodies[a].shape;
         o.in_other = 0;
         if (boxes_meet(o.other, &body->shape, def->dimension)) {
+            o.region = mpm_region_create(o.other, def->dimension, o.unit);
             mpm_seed(def, body, look_in_other, &o);
+            mpm_region_free(o.region);
         }
         if (o.in_other) {
             FAULT(r, MPM_ERR_CONFLICT, TEXT("/bodies/%s%s", body->name, place),

@@ -7,6 +7,7 @@
 #include "server/mpm/seed.h"
 
 #include <math.h>
+#include <stdlib.h>
 
 #include "server/mpm/solution.h"
 
@@ -30,28 +31,134 @@ static int between(double from, double to, double origin, double unit, double po
     return point < a || point > b ? -1 : point == a || point == b ? 0 : 1;
 }
 
-// The vertices are snapped, so with vertices on the half-spacing lattice every product below is
-// exact.
-static int polygon_side(const struct mpm_shape *shape, const struct lattice *l,
-                        const double *point) {
-    bool inside = false;
-    for (size_t i = 0, j = shape->n_points - 1; i < shape->n_points; j = i++) {
-        double a[2], b[2];
-        for (int d = 0; d < 2; d++) {
-            a[d] = snapped(shape->points[2 * j + (size_t)d], l->origin[d], l->unit) - point[d];
-            b[d] = snapped(shape->points[2 * i + (size_t)d], l->origin[d], l->unit) - point[d];
+// ---- Forms: polygons made ready for many points -----------------------------------------------
+
+#define BANDS 64 // of a polygon's height
+
+// A shape's tree once more, with what its polygons need: for each band of their height the edges
+// that reach into it, so that a point looks at few of them. A form without edges says nothing.
+struct form {
+    struct form *children; // those of the shape
+    double (*edges)[4];    // from (x, y) to (x, y), snapped, band by band
+    size_t begin[BANDS + 1];
+    double low, high; // heights that they reach, with 1 to spare
+};
+
+static void form_clear(struct form *form, const struct mpm_shape *shape) {
+    for (size_t k = 0; form->children && k < shape->n_children; k++) {
+        form_clear(&form->children[k], &shape->children[k]);
+    }
+    free(form->children);
+    free(form->edges);
+}
+
+static size_t band_of(const struct form *form, double height) {
+    const double band = (height - form->low) / (form->high - form->low) * BANDS;
+    return band < 0 ? 0 : band < BANDS - 1 ? (size_t)band : BANDS - 1;
+}
+
+// Without memory the form stays empty: then every edge is looked at.
+static void form_polygon(struct form *form, const struct mpm_shape *shape,
+                         const struct lattice *l) {
+    const size_t n = shape->n_points;
+    double(*edges)[4] = calloc(n + 1, sizeof *edges);
+    form->low = INFINITY;
+    form->high = -INFINITY;
+    for (size_t i = 0, j = n - 1; edges && i < n; j = i++) {
+        for (size_t d = 0; d < 2; d++) {
+            edges[i][d] = snapped(shape->points[2 * j + d], l->origin[d], l->unit);
+            edges[i][2 + d] = snapped(shape->points[2 * i + d], l->origin[d], l->unit);
         }
-        const double cross = a[0] * b[1] - a[1] * b[0];
-        const double length = hypot(b[0] - a[0], b[1] - a[1]);
-        const double dot = a[0] * b[0] + a[1] * b[1];
-        if (fabs(cross) <= SNAP * length && dot <= SNAP) {
-            return 0; // between the ends of this edge
+        form->low = fmin(form->low, edges[i][1] - 1);
+        form->high = fmax(form->high, edges[i][1] + 1);
+    }
+    size_t count = 0;
+    for (int pass = 0; edges && pass < 2; pass++) { // counts, then puts them there
+        count = 0;
+        for (size_t band = 0; band < BANDS; band++) {
+            form->begin[band] = count;
+            for (size_t i = 0; i < n; i++) {
+                const double lower = fmin(edges[i][1], edges[i][3]) - 1;
+                const double upper = fmax(edges[i][1], edges[i][3]) + 1;
+                if (band < band_of(form, lower) || band > band_of(form, upper)) {
+                    continue;
+                }
+                if (pass == 1) {
+                    for (size_t d = 0; d < 4; d++) {
+                        form->edges[count][d] = edges[i][d];
+                    }
+                }
+                count++;
+            }
         }
-        if ((a[1] > 0) != (b[1] > 0)) { // the edge crosses the ray to +x on the one side of it
-            inside ^= (cross > 0) == (b[1] > a[1]);
+        form->begin[BANDS] = count;
+        if (pass == 0 && !(form->edges = calloc(count + 1, sizeof *edges))) {
+            break;
         }
     }
-    return inside ? 1 : -1;
+    free(edges);
+}
+
+static void form_fill(struct form *form, const struct mpm_shape *shape, const struct lattice *l) {
+    *form = (struct form){0};
+    if (shape->kind == MPM_SHAPE_POLYGON || shape->kind == MPM_SHAPE_EXTRUDE) {
+        form_polygon(form, shape, l);
+    } else if (shape->n_children > 0) {
+        form->children = calloc(shape->n_children, sizeof *form->children);
+        for (size_t k = 0; form->children && k < shape->n_children; k++) {
+            form_fill(&form->children[k], &shape->children[k], l);
+        }
+    }
+}
+
+// ---- On which side of a shape a point lies ----------------------------------------------------
+
+struct crossing {
+    bool inside; // so far: an odd number of edges lies to the right
+    bool on_edge;
+};
+
+static void cross_edge(struct crossing *c, const double *from, const double *to,
+                       const double *point) {
+    const double a[2] = {from[0] - point[0], from[1] - point[1]};
+    const double b[2] = {to[0] - point[0], to[1] - point[1]};
+    if ((a[1] > 1 && b[1] > 1) || (a[1] < -1 && b[1] < -1)) {
+        return; // neither near it nor across the ray
+    }
+    const double cross = a[0] * b[1] - a[1] * b[0];
+    const double length = hypot(b[0] - a[0], b[1] - a[1]);
+    const double dot = a[0] * b[0] + a[1] * b[1];
+    if (fabs(cross) <= SNAP * length && dot <= SNAP) {
+        c->on_edge = true; // between the ends of this edge
+    }
+    if ((a[1] > 0) != (b[1] > 0)) { // the edge crosses the ray to +x on the one side of it
+        c->inside ^= (cross > 0) == (b[1] > a[1]);
+    }
+}
+
+// The vertices are snapped, so with vertices on the half-spacing lattice every product is exact.
+static int polygon_side(const struct mpm_shape *shape, const struct form *form,
+                        const struct lattice *l, const double *point) {
+    struct crossing c = {0};
+    if (form && form->edges) {
+        if (point[1] < form->low || point[1] > form->high) {
+            return -1;
+        }
+        const size_t band = band_of(form, point[1]);
+        for (size_t k = form->begin[band]; !c.on_edge && k < form->begin[band + 1]; k++) {
+            cross_edge(&c, form->edges[k], form->edges[k] + 2, point);
+        }
+        return c.on_edge ? 0 : c.inside ? 1 : -1;
+    }
+    for (size_t i = 0, j = shape->n_points - 1; !c.on_edge && i < shape->n_points; j = i++) {
+        double a[2], b[2];
+        for (size_t d = 0; d < 2; d++) {
+            a[d] = snapped(shape->points[2 * j + d], l->origin[d], l->unit);
+            b[d] = snapped(shape->points[2 * i + d], l->origin[d], l->unit);
+        }
+        cross_edge(&c, a, b, point);
+    }
+    return c.on_edge ? 0 : c.inside ? 1 : -1;
 }
 
 static int cylinder_side(const struct mpm_shape *shape, const struct lattice *l,
@@ -72,7 +179,10 @@ static int cylinder_side(const struct mpm_shape *shape, const struct lattice *l,
 }
 
 // Sign of how far the point is inside the shape: > 0 inside, 0 on the edge, < 0 outside.
-static int side(const struct mpm_shape *shape, const struct lattice *l, const double *point) {
+// `form` may be NULL.
+static int side(const struct mpm_shape *shape, const struct form *form, const struct lattice *l,
+                const double *point) {
+    const struct form *children = form ? form->children : NULL;
     switch (shape->kind) {
     case MPM_SHAPE_BOX: {
         int least = 1;
@@ -92,9 +202,9 @@ static int side(const struct mpm_shape *shape, const struct lattice *l, const do
         return fabs(gap) < SNAP * radius ? 0 : gap > 0 ? 1 : -1;
     }
     case MPM_SHAPE_POLYGON:
-        return polygon_side(shape, l, point);
+        return polygon_side(shape, form, l, point);
     case MPM_SHAPE_EXTRUDE: {
-        const int across = polygon_side(shape, l, point);
+        const int across = polygon_side(shape, form, l, point);
         const int along = between(shape->min[2], shape->max[2], l->origin[2], l->unit, point[2]);
         return across < along ? across : along;
     }
@@ -104,8 +214,9 @@ static int side(const struct mpm_shape *shape, const struct lattice *l, const do
         return -1;
     case MPM_SHAPE_UNION: {
         int most = -1;
-        for (size_t k = 0; k < shape->n_children; k++) {
-            const int here = side(&shape->children[k], l, point);
+        for (size_t k = 0; most < 1 && k < shape->n_children; k++) {
+            const int here =
+                side(&shape->children[k], children ? &children[k] : NULL, l, point);
             most = here > most ? here : most;
         }
         return most;
@@ -113,9 +224,10 @@ static int side(const struct mpm_shape *shape, const struct lattice *l, const do
     case MPM_SHAPE_DIFFERENCE:
     case MPM_SHAPE_INTERSECTION: {
         int least = 1;
-        for (size_t k = 0; k < shape->n_children; k++) {
+        for (size_t k = 0; least > -1 && k < shape->n_children; k++) {
             const int sign = shape->kind == MPM_SHAPE_DIFFERENCE && k > 0 ? -1 : 1;
-            const int here = sign * side(&shape->children[k], l, point);
+            const int here =
+                sign * side(&shape->children[k], children ? &children[k] : NULL, l, point);
             least = here < least ? here : least;
         }
         return least;
@@ -124,14 +236,45 @@ static int side(const struct mpm_shape *shape, const struct lattice *l, const do
     return -1;
 }
 
-bool mpm_shape_contains(const struct mpm_shape *shape, const double *x, int dim, double margin) {
-    // In units of the margin, so that "on the edge" is anything closer than SNAP margins.
-    const struct lattice l = {.dim = dim, .unit = margin};
+struct mpm_region {
+    const struct mpm_shape *shape;
+    struct lattice lattice; // in units of the margin: "on the edge" is closer than SNAP margins
+    struct form form;
+};
+
+static bool contains(const struct mpm_shape *shape, const struct form *form,
+                     const struct lattice *l, const double *x) {
     double point[MPM_MAX_DIM];
-    for (int d = 0; d < dim; d++) {
-        point[d] = x[d] / margin;
+    for (int d = 0; d < l->dim; d++) {
+        point[d] = x[d] / l->unit;
     }
-    return side(shape, &l, point) > 0;
+    return side(shape, form, l, point) > 0;
+}
+
+bool mpm_shape_contains(const struct mpm_shape *shape, const double *x, int dim, double margin) {
+    const struct lattice l = {.dim = dim, .unit = margin};
+    return contains(shape, NULL, &l, x);
+}
+
+struct mpm_region *mpm_region_create(const struct mpm_shape *shape, int dim, double margin) {
+    struct mpm_region *region = calloc(1, sizeof *region);
+    if (region) {
+        region->shape = shape;
+        region->lattice = (struct lattice){.dim = dim, .unit = margin};
+        form_fill(&region->form, shape, &region->lattice);
+    }
+    return region;
+}
+
+bool mpm_region_contains(const struct mpm_region *region, const double *x) {
+    return contains(region->shape, &region->form, &region->lattice, x);
+}
+
+void mpm_region_free(struct mpm_region *region) {
+    if (region) {
+        form_clear(&region->form, region->shape);
+    }
+    free(region);
 }
 
 bool mpm_shape_bounds(const struct mpm_shape *shape, int dim, double *min, double *max) {
@@ -282,26 +425,28 @@ size_t mpm_seed(const struct mpm_def *def, const struct mpm_body_def *body,
     if (!each && body->shape.kind == MPM_SHAPE_BOX) {
         return count_box(&body->shape, &l, from, to);
     }
+    struct form form;
+    form_fill(&form, &body->shape, &l);
     size_t count = 0;
-    for (long long i = from[0]; i < to[0]; i++) {
-        for (long long j = from[1]; j < to[1]; j++) {
-            for (long long k = from[2]; k < to[2]; k++) {
+    bool wanted = true;
+    for (long long i = from[0]; wanted && i < to[0]; i++) {
+        for (long long j = from[1]; wanted && j < to[1]; j++) {
+            for (long long k = from[2]; wanted && k < to[2]; k++) {
                 const long long index[MPM_MAX_DIM] = {i, j, k};
                 double point[MPM_MAX_DIM], x[MPM_MAX_DIM];
                 for (int d = 0; d < dim; d++) {
                     point[d] = (double)(2 * index[d] + 1);
                     x[d] = l.origin[d] + ((double)index[d] + 0.5) * spacing;
                 }
-                if (side(&body->shape, &l, point) < (l.closed ? 0 : 1)) {
+                if (side(&body->shape, &form, &l, point) < (l.closed ? 0 : 1)) {
                     continue;
                 }
-                if (each && !each(context, x, volume)) {
-                    return count;
-                }
-                count++;
+                wanted = !each || each(context, x, volume);
+                count += wanted;
             }
         }
     }
+    form_clear(&form, &body->shape);
     return count;
 }
 

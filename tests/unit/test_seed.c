@@ -502,6 +502,63 @@ static void test_seed_cylinder_has_its_volume(void **state) {
     assert_int_equal(count(&coarse, &edge, 2, false), 3 * 69);
 }
 
+struct brute {
+    const struct mpm_shape *shape;
+    double margin;
+    struct mpm_region *region;
+    size_t count;
+};
+
+static bool look_again(void *context, const double *x, double volume) {
+    struct brute *b = context;
+    (void)volume;
+    assert_true(mpm_shape_contains(b->shape, x, 2, b->margin));
+    assert_true(mpm_region_contains(b->region, x));
+    b->count++;
+    return true;
+}
+
+// Edges are sorted into bands of height, so that a point looks at few of them: the points are those
+// that looking at every edge finds. Stars with corners on lattice points, between them, and far out.
+static void test_seed_of_many_corners_is_what_each_edge_says(void **state) {
+    (void)state;
+    const double h = 0.25, spacing = h / 4;
+    const struct mpm_def def = domain(2, h, zero); // 40 by 40 lattice points; all exact in binary
+    srand(7);
+    for (int round = 0; round < 60; round++) {
+        const size_t n = 3 + (size_t)(rand() % 150);
+        double points[2 * 153];
+        for (size_t k = 0; k < n; k++) {
+            const double angle = 2 * M_PI * (double)k / (double)n;
+            const double r = 0.2 + 1.0 * rand() / RAND_MAX;
+            points[2 * k] = 1.25 + r * cos(angle);
+            points[2 * k + 1] = 1.25 + r * sin(angle);
+            if (round % 3 == 0) // on places of half a spacing: many points lie on edges
+                for (size_t d = 0; d < 2; d++)
+                    points[2 * k + d] = spacing / 2 * rint(points[2 * k + d] * 2 / spacing);
+        }
+        struct mpm_shape parts[2] = {
+            {.kind = MPM_SHAPE_POLYGON, .points = points, .n_points = n},
+            {.kind = MPM_SHAPE_BALL, .centre = {1.25, 1.5}, .radius = 0.3},
+        };
+        struct mpm_shape shape = {.kind = round % 2 == 0 ? MPM_SHAPE_UNION : MPM_SHAPE_DIFFERENCE,
+                                  .children = parts,
+                                  .n_children = 2};
+        const struct mpm_body_def body = {.shape = shape, .particles_per_direction = 4};
+        struct brute b = {.shape = &shape, .margin = spacing / 2};
+        b.region = mpm_region_create(&shape, 2, b.margin);
+        const size_t found = mpm_seed(&def, &body, look_again, &b);
+        assert_int_equal(found, b.count);
+        size_t every = 0;
+        for (int i = 0; i < 40; i++)
+            for (int j = 0; j < 40; j++)
+                every += mpm_shape_contains(
+                    &shape, (double[2]){(i + 0.5) * spacing, (j + 0.5) * spacing}, 2, b.margin);
+        assert_int_equal(b.count, every);
+        mpm_region_free(b.region);
+    }
+}
+
 int main(int argc, char **argv) {
     feenableexcept(FE_DIVBYZERO | FE_INVALID | FE_OVERFLOW);
     const struct CMUnitTest tests[] = {
@@ -525,6 +582,7 @@ int main(int argc, char **argv) {
         cmocka_unit_test(test_seed_polygon_vertices_on_lattice_points),
         cmocka_unit_test(test_seed_polygon_contains_and_bounds),
         cmocka_unit_test(test_seed_cylinder_has_its_volume),
+        cmocka_unit_test(test_seed_of_many_corners_is_what_each_edge_says),
     };
     cmocka_set_test_filter(argc > 1 ? argv[1] : NULL);
     return cmocka_run_group_tests(tests, NULL, NULL);
