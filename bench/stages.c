@@ -95,7 +95,7 @@ void stages_of(struct mpm_sim *sim) {
         memset(sim->grid.fbar, 0, nodes * (size_t)sim->grid.fbar_stride * sizeof(double));
         run(sim->kernels->p2g, sim, span);
         run(sim->kernels->g2p, sim, span);
-        mpm_fbar_average(&sim->grid, sim->walls, sim->n_walls, 1);
+        mpm_fbar_average(&sim->grid, sim->walls, sim->n_walls, sim->team);
         row(sim, 2, kernels->fbar, span);
     }
 }

@@ -2,12 +2,13 @@
 #pragma once
 #include "server/mpm/boundary.h"
 #include "server/mpm/particles.h"
+#include "server/mpm/team.h"
 
 // Sums besides V that a scheme averages: 0, 1 or 2.
 int mpm_fbar_scalars(enum mpm_fbar_scheme scheme);
 // Between scatter and finish: sums become averages; a node without volume stays out.
 void mpm_fbar_average(struct mpm_grid *grid, const struct mpm_wall *walls, size_t n_walls,
-                      int n_threads);
+                      struct mpm_team *team);
 // max |ln(J/Jbar)| over the particles of one body: how far the volume that forces use (or, for a
 // fluid under F-bar, its raw volume ratio) has come from the ratio that stress uses. Infinite when
 // a raw ratio is not positive.

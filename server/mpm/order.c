@@ -18,8 +18,8 @@ size_t mpm_sorter_bytes(size_t n, int n_threads) {
     return 4 * numbers_bytes(n) + (size_t)n_threads * N_DIGITS * sizeof(uint32_t);
 }
 
-bool mpm_sorter_create(struct mpm_sorter *sorter, size_t n, int n_threads) {
-    *sorter = (struct mpm_sorter){.n_threads = n_threads, .bytes = mpm_sorter_bytes(n, n_threads)};
+bool mpm_sorter_create(struct mpm_sorter *sorter, size_t n, struct mpm_team *team) {
+    *sorter = (struct mpm_sorter){.team = team, .bytes = mpm_sorter_bytes(n, team->n_threads)};
     char *memory = aligned_alloc(64, sorter->bytes);
     if (!memory) {
         return false;
@@ -66,84 +66,100 @@ static size_t part_begin(size_t n, int k, int n_parts) {
     return n * (size_t)k / (size_t)n_parts;
 }
 
-static void find_keys(const struct mpm_particles *s, const struct mpm_grid *g, enum mpm_basis basis,
-                      uint32_t *key, int n_threads) {
-    (void)n_threads; // without OpenMP
-#pragma omp parallel for schedule(static) num_threads(n_threads) if (n_threads > 1)
-    for (size_t p = 0; p < s->n; p++) {
+struct keying {
+    const struct mpm_particles *s;
+    const struct mpm_grid *grid;
+    enum mpm_basis basis;
+    uint32_t *key;
+};
+
+static void find_keys(void *context, int own, int there) {
+    const struct keying *k = context;
+    const struct mpm_grid *g = k->grid;
+    const size_t n = k->s->n, end = part_begin(n, own + 1, there);
+    for (size_t p = part_begin(n, own, there); p < end; p++) {
         int base[MPM_MAX_DIM];
         for (int d = 0; d < g->dim; d++) {
-            base[d] = (int)mpm_base(basis, (s->x[mpm_at(p, g->dim, d)] - g->origin[d]) * g->inv_h);
+            base[d] =
+                (int)mpm_base(k->basis, (k->s->x[mpm_at(p, g->dim, d)] - g->origin[d]) * g->inv_h);
         }
-        key[p] = g->dim == 2 ? mpm_cell_key(g, base, 2) : mpm_cell_key(g, base, 3);
+        k->key[p] = g->dim == 2 ? mpm_cell_key(g, base, 2) : mpm_cell_key(g, base, 3);
     }
 }
 
-// One stable pass by the digit at `shift`, in parts that count and then move by themselves; the
-// outcome does not depend on their number.
-static void radix_pass(struct mpm_sorter *sorter, int turn, bool first, size_t n, uint32_t least,
-                       int shift) {
-    const uint32_t *key = sorter->key[turn], *from = sorter->from[turn];
-    uint32_t *key_out = sorter->key[!turn], *from_out = sorter->from[!turn];
-    const int n_parts = sorter->n_threads;
-    uint32_t(*const count)[N_DIGITS] = (uint32_t(*)[N_DIGITS])(void *)sorter->count;
-    memset(count, 0, (size_t)n_parts * sizeof *count);
-#pragma omp parallel for schedule(static) num_threads(n_parts) if (n_parts > 1)
-    for (int k = 0; k < n_parts; k++) {
-        for (size_t i = part_begin(n, k, n_parts); i < part_begin(n, k + 1, n_parts); i++) {
-            count[k][(key[i] - least) >> shift & (N_DIGITS - 1)]++;
+// One stable pass by the digit at `shift`, in parts, one a thread, that count and then move by
+// themselves; the outcome does not depend on their number.
+struct radix_pass {
+    const uint32_t *key, *from;
+    uint32_t *key_out, *from_out, (*count)[N_DIGITS];
+    size_t n;
+    uint32_t least;
+    int shift;
+    bool first;
+    struct mpm_team *team;
+};
+
+static void run_radix_pass(void *context, int own, int there) {
+    const struct radix_pass *r = context;
+    const size_t begin = part_begin(r->n, own, there), end = part_begin(r->n, own + 1, there);
+    uint32_t *count = r->count[own];
+    memset(count, 0, sizeof r->count[own]);
+    for (size_t i = begin; i < end; i++) {
+        count[(r->key[i] - r->least) >> r->shift & (N_DIGITS - 1)]++;
+    }
+    mpm_team_barrier(r->team, there);
+    if (own == 0) {
+        uint32_t sum = 0;
+        for (int digit = 0; digit < N_DIGITS; digit++) {
+            for (int k = 0; k < there; k++) {
+                const uint32_t c = r->count[k][digit];
+                r->count[k][digit] = sum;
+                sum += c;
+            }
         }
     }
-    uint32_t sum = 0;
-    for (int digit = 0; digit < N_DIGITS; digit++) {
-        for (int k = 0; k < n_parts; k++) {
-            const uint32_t c = count[k][digit];
-            count[k][digit] = sum;
-            sum += c;
-        }
-    }
-#pragma omp parallel for schedule(static) num_threads(n_parts) if (n_parts > 1)
-    for (int k = 0; k < n_parts; k++) {
-        for (size_t i = part_begin(n, k, n_parts); i < part_begin(n, k + 1, n_parts); i++) {
-            const uint32_t to = count[k][(key[i] - least) >> shift & (N_DIGITS - 1)]++;
-            key_out[to] = key[i];
-            from_out[to] = first ? (uint32_t)i : from[i];
-        }
+    mpm_team_barrier(r->team, there);
+    for (size_t i = begin; i < end; i++) {
+        const uint32_t to = count[(r->key[i] - r->least) >> r->shift & (N_DIGITS - 1)]++;
+        r->key_out[to] = r->key[i];
+        r->from_out[to] = r->first ? (uint32_t)i : r->from[i];
     }
 }
 
 struct moving {
     const uint32_t *from;
-    double *room;
+    double *room, *field;
     size_t n;
-    int n_threads;
+    int components;
+    struct mpm_team *team;
 };
 
-static void move_field(void *context, double *field, int components) {
+static void move_components(void *context, int own, int there) {
     const struct moving *m = context;
-    const size_t n = m->n;
-    for (int c = 0; c < components; c++) {
-#pragma omp parallel num_threads(m->n_threads) if (m->n_threads > 1)
-        {
-#pragma omp for schedule(static)
-            for (size_t p = 0; p < n; p++) {
-                m->room[p] = field[mpm_at(m->from[p], components, c)];
-            }
-#pragma omp for schedule(static)
-            for (size_t p = 0; p < n; p++) {
-                field[mpm_at(p, components, c)] = m->room[p];
-            }
+    const size_t begin = part_begin(m->n, own, there), end = part_begin(m->n, own + 1, there);
+    for (int c = 0; c < m->components; c++) {
+        for (size_t p = begin; p < end; p++) {
+            m->room[p] = m->field[mpm_at(m->from[p], m->components, c)];
+        }
+        mpm_team_barrier(m->team, there); // the field is read
+        for (size_t p = begin; p < end; p++) {
+            m->field[mpm_at(p, m->components, c)] = m->room[p];
         }
     }
+}
+
+static void move_field(void *context, double *field, int components) {
+    struct moving *m = context;
+    m->field = field;
+    m->components = components;
+    mpm_team_run(m->team, move_components, m);
 }
 
 static void move_particles(struct mpm_particles *s, const uint32_t *from,
                            struct mpm_sorter *sorter) {
     // Both arrays of keys lie together: room for n doubles.
-    struct moving m = {.from = from,
-                       .room = (double *)(void *)sorter->key[0],
-                       .n = s->n,
-                       .n_threads = sorter->n_threads};
+    struct moving m = {
+        .from = from, .room = (double *)(void *)sorter->key[0], .n = s->n, .team = sorter->team};
     mpm_particles_each(s, move_field, &m);
     uint32_t *ids = sorter->key[0];
     for (size_t p = 0; p < s->n; p++) {
@@ -177,7 +193,7 @@ bool mpm_order_sort(struct mpm_order *order, struct mpm_particles *s, const stru
                     enum mpm_basis basis, struct mpm_sorter *sorter) {
     const size_t n = s->n;
     uint32_t *key = sorter->key[0];
-    find_keys(s, grid, basis, key, sorter->n_threads);
+    mpm_team_run(sorter->team, find_keys, &(struct keying){s, grid, basis, key});
     uint32_t least = UINT32_MAX, most = 0;
     bool sorted = true;
     for (size_t p = 0; p < n; p++) {
@@ -190,7 +206,17 @@ bool mpm_order_sort(struct mpm_order *order, struct mpm_particles *s, const stru
     }
     int turn = 0;
     for (int shift = 0; shift < 32 && (most - least) >> shift > 0; shift += DIGIT, turn ^= 1) {
-        radix_pass(sorter, turn, shift == 0, n, least, shift);
+        struct radix_pass pass = {.key = sorter->key[turn],
+                                  .from = sorter->from[turn],
+                                  .key_out = sorter->key[!turn],
+                                  .from_out = sorter->from[!turn],
+                                  .count = (uint32_t(*)[N_DIGITS])(void *)sorter->count,
+                                  .n = n,
+                                  .least = least,
+                                  .shift = shift,
+                                  .first = shift == 0,
+                                  .team = sorter->team};
+        mpm_team_run(sorter->team, run_radix_pass, &pass);
     }
     const bool found = find_tiles(order, grid, sorter->key[turn], n);
     move_particles(s, sorter->from[turn], sorter);

@@ -9,6 +9,7 @@
 #pragma once
 #include "server/mpm/grid.h"
 #include "server/mpm/particles.h"
+#include "server/mpm/team.h"
 
 #define MPM_MAX_COLOURS 27
 
@@ -32,11 +33,11 @@ struct mpm_order {
 struct mpm_sorter {
     uint32_t *key[2], *from[2]; // (n) each; key also serves as one array of doubles
     uint32_t *count;            // (threads, digits) of the radix sort
-    int n_threads;
+    struct mpm_team *team;      // borrowed
     size_t bytes;
 };
 
-bool mpm_sorter_create(struct mpm_sorter *sorter, size_t n, int n_threads);
+bool mpm_sorter_create(struct mpm_sorter *sorter, size_t n, struct mpm_team *team);
 void mpm_sorter_free(struct mpm_sorter *sorter);
 size_t mpm_sorter_bytes(size_t n, int n_threads);
 

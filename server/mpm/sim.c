@@ -476,9 +476,13 @@ enum mpm_status mpm_create(const struct mpm_def *def, struct mpm_sim **out, stru
         largest = sim->sets[b].n > largest ? sim->sets[b].n : largest;
     }
     sim->turns = aligned_alloc(64, (size_t)def->n_threads * sizeof *sim->turns);
-    if (!sim->turns || !mpm_sorter_create(&sim->sorter, largest, def->n_threads) ||
-        !create_probes(sim) || !create_body_forces(sim) ||
-        !mpm_provide_fbar(sim, widest_fbar(def))) {
+    sim->team = aligned_alloc(64, sizeof *sim->team);
+    if (!sim->turns || !sim->team) {
+        goto fail;
+    }
+    mpm_team_create(sim->team, def->n_threads);
+    if (!mpm_sorter_create(&sim->sorter, largest, sim->team) || !create_probes(sim) ||
+        !create_body_forces(sim) || !mpm_provide_fbar(sim, widest_fbar(def))) {
         goto fail;
     }
     sim->c.base = def->settings;
@@ -514,6 +518,7 @@ void mpm_free(struct mpm_sim *sim) {
         mpm_order_free(&sim->orders[b]);
     }
     mpm_sorter_free(&sim->sorter);
+    free(sim->team);
     free(sim->turns);
     for (size_t k = 0; sim->walls && k < sim->n_walls; k++) {
         mpm_wall_free(&sim->walls[k]);

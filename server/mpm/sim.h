@@ -57,6 +57,7 @@ struct mpm_sim {
     size_t n_sets, n_walls, n_loads, n_rigids, n_particles, n_results;
     struct mpm_particles *sets; // one a body
     struct mpm_order *orders;   // one a body
+    struct mpm_team *team;
     struct mpm_sorter sorter;
     struct mpm_turn *turns; // (n_threads)
     struct mpm_wall *walls;

@@ -4,40 +4,38 @@
 #include <stdint.h>
 #include <stdio.h>
 #include <string.h>
-#ifdef _OPENMP
-#include <omp.h>
-#endif
 
 #include "server/mpm/sim.h"
 
-#define SLOTS_A_PART 64 // blocks of nodes that a thread takes at a time
 #define UNSTABLE_CFL                                                                               \
     1.0 // no basis is stable at dt >= 0.9 h/c (docs/method.md): beyond this it is not tried
 
-static void move_nodes(const struct mpm_sim *sim, const struct mpm_motion *motion) {
-    const struct mpm_grid *grid = &sim->grid;
-    const int n_threads = sim->def->n_threads;
-    const uint32_t n_parts = n_threads > 1 ? grid->n_slots / SLOTS_A_PART + 1 : 1;
-    (void)n_threads; // without OpenMP
-#pragma omp parallel for schedule(static) num_threads(n_threads) if (n_threads > 1)
-    for (uint32_t k = 0; k < n_parts; k++) {
-        const uint32_t begin = n_parts > 1 ? k * SLOTS_A_PART : 0;
-        const uint32_t end = n_parts > 1 ? begin + SLOTS_A_PART : grid->n_slots;
-        sim->kernels->move_nodes(grid, begin > 1 ? begin : 1,
-                                 end < grid->n_slots ? end : grid->n_slots, motion);
+struct nodes_work {
+    const struct mpm_sim *sim;
+    struct mpm_motion motion;
+    bool fbar;
+};
+
+static void move_nodes(void *context, int own, int there) {
+    const struct nodes_work *w = context;
+    uint32_t begin, end;
+    mpm_grid_part(&w->sim->grid, own, there, &begin, &end);
+    if (begin < end) {
+        w->sim->kernels->move_nodes(&w->sim->grid, begin, end, &w->motion);
     }
 }
 
-static void clear_nodes(struct mpm_grid *grid, bool fbar, int n_threads) {
-    const size_t nodes = (size_t)MPM_BLOCK_NODES(grid->dim);
-    const size_t scalars = (size_t)grid->fbar_stride;
-    (void)n_threads; // without OpenMP
-#pragma omp parallel for schedule(static) num_threads(n_threads) if (n_threads > 1)
-    for (size_t s = 0; s < grid->n_slots; s++) {
-        memset(grid->node + s * nodes * MPM_NODE, 0, nodes * MPM_NODE * sizeof(double));
-        if (fbar) {
-            memset(grid->fbar + s * nodes * scalars, 0, nodes * scalars * sizeof(double));
-        }
+static void clear_nodes(void *context, int own, int there) {
+    const struct nodes_work *w = context;
+    const struct mpm_grid *grid = &w->sim->grid;
+    const size_t nodes = (size_t)MPM_BLOCK_NODES(grid->dim), scalars = (size_t)grid->fbar_stride;
+    uint32_t begin, end;
+    mpm_grid_part(grid, own, there, &begin, &end);
+    begin -= own == 0; // slot 0 as well
+    const size_t first = begin * nodes, n = (end - begin) * nodes;
+    memset(grid->node + first * MPM_NODE, 0, n * MPM_NODE * sizeof(double));
+    if (w->fbar) {
+        memset(grid->fbar + first * scalars, 0, n * scalars * sizeof(double));
     }
 }
 
@@ -90,70 +88,79 @@ static size_t part_begin(const struct mpm_order *order, int colour, int k, int n
 // Work that adds to the grid goes tile by tile and colour by colour: tiles of one colour reach no
 // common node, and those of the next wait for them, so that every node's sum has one order whatever
 // the number of threads.
-static void for_tiles(const struct mpm_sim *sim, size_t body, struct mpm_span span,
-                      span_work *work) {
-    const struct mpm_order *order = &sim->orders[body];
-    const int n_threads = sim->def->n_threads;
-    for (int k = 0; k < n_threads; k++) {
-        atomic_store(&sim->turns[k].next[0], part_begin(order, 0, k, n_threads));
-    }
-#pragma omp parallel num_threads(n_threads) if (n_threads > 1)
-    {
-#ifdef _OPENMP
-        const int own = omp_get_thread_num(), there = omp_get_num_threads();
-#else
-        const int own = 0, there = 1;
-#endif
-        for (int colour = 0; colour < order->n_colours; colour++) {
-            // First one's own part, then what others have not begun.
-            for (int k = 0; k < n_threads; k++) {
-                const int part = (own + k) % n_threads;
-                const size_t end = part_begin(order, colour, part + 1, n_threads);
-                atomic_size_t *turn = &sim->turns[part].next[colour % 2];
-                for (size_t i; (i = atomic_fetch_add(turn, 1)) < end;) {
-                    const size_t t = order->by_colour[i];
-                    const size_t next = i + 1 < order->n_tiles ? order->by_colour[i + 1] : t;
-                    work_on(sim, span, order->tile[t].begin, order->tile[t].end,
-                            order->tile[next].begin, work, &sim->results[t]);
-                }
+struct particles_work {
+    const struct mpm_sim *sim;
+    const struct mpm_order *order;
+    struct mpm_span span;
+    span_work *work;
+};
+
+static void work_on_tiles(void *context, int own, int there) {
+    const struct particles_work *w = context;
+    const struct mpm_order *order = w->order;
+    struct mpm_turn *turns = w->sim->turns;
+    const int n_parts = w->sim->team->n_threads;
+    for (int colour = 0; colour < order->n_colours; colour++) {
+        // First one's own part, then what others have not begun.
+        for (int k = 0; k < n_parts; k++) {
+            const int part = (own + k) % n_parts;
+            const size_t end = part_begin(order, colour, part + 1, n_parts);
+            atomic_size_t *turn = &turns[part].next[colour % 2];
+            for (size_t i; (i = atomic_fetch_add(turn, 1)) < end;) {
+                const size_t t = order->by_colour[i];
+                const size_t next = i + 1 < order->n_tiles ? order->by_colour[i + 1] : t;
+                work_on(w->sim, w->span, order->tile[t].begin, order->tile[t].end,
+                        order->tile[next].begin, w->work, &w->sim->results[t]);
             }
-            if (colour + 1 == order->n_colours) {
-                break; // the region's end is a barrier, too
-            }
-            for (int part = own; part < n_threads; part += there) {
-                atomic_store(&sim->turns[part].next[(colour + 1) % 2],
-                             part_begin(order, colour + 1, part, n_threads));
-            }
-#pragma omp barrier
         }
+        if (colour + 1 == order->n_colours) {
+            break; // the end of the work is a barrier, too
+        }
+        for (int part = own; part < n_parts; part += there) {
+            atomic_store(&turns[part].next[(colour + 1) % 2],
+                         part_begin(order, colour + 1, part, n_parts));
+        }
+        mpm_team_barrier(w->sim->team, there);
     }
+}
+
+static void for_tiles(struct particles_work *w) {
+    const int n_parts = w->sim->team->n_threads;
+    for (int k = 0; k < n_parts; k++) {
+        atomic_store(&w->sim->turns[k].next[0], part_begin(w->order, 0, k, n_parts));
+    }
+    mpm_team_run(w->sim->team, work_on_tiles, w);
 }
 
 // All other work goes in chunks of equal size. They do not take equal time, since what flows costs
 // more: first one's own part, as with tiles, then what others have not begun.
-static size_t for_chunks(const struct mpm_sim *sim, struct mpm_span span, span_work *work) {
-    const size_t n = span.s->n, n_chunks = (n + MPM_CHUNK - 1) / MPM_CHUNK;
-    const int n_threads = sim->def->n_threads;
-    for (int k = 0; k < n_threads; k++) {
-        atomic_store(&sim->turns[k].next[0], n_chunks * (size_t)k / (size_t)n_threads);
-    }
-#pragma omp parallel num_threads(n_threads) if (n_threads > 1)
-    {
-#ifdef _OPENMP
-        const int own = omp_get_thread_num();
-#else
-        const int own = 0;
-#endif
-        for (int k = 0; k < n_threads; k++) {
-            const int part = (own + k) % n_threads;
-            const size_t part_end = n_chunks * (size_t)(part + 1) / (size_t)n_threads;
-            for (size_t i; (i = atomic_fetch_add(&sim->turns[part].next[0], 1)) < part_end;) {
-                const size_t begin = i * MPM_CHUNK, end = begin + MPM_CHUNK;
-                work_on(sim, span, begin, end < n ? end : n, end < n ? end : begin, work,
-                        &sim->results[i]);
-            }
+static size_t n_chunks_of(const struct particles_work *w) {
+    return (w->span.s->n + MPM_CHUNK - 1) / MPM_CHUNK;
+}
+
+static void work_on_chunks(void *context, int own, int there) {
+    const struct particles_work *w = context;
+    const size_t n = w->span.s->n, n_chunks = n_chunks_of(w);
+    const int n_parts = w->sim->team->n_threads;
+    (void)there;
+    for (int k = 0; k < n_parts; k++) {
+        const int part = (own + k) % n_parts;
+        const size_t part_end = n_chunks * (size_t)(part + 1) / (size_t)n_parts;
+        for (size_t i; (i = atomic_fetch_add(&w->sim->turns[part].next[0], 1)) < part_end;) {
+            const size_t begin = i * MPM_CHUNK, end = begin + MPM_CHUNK;
+            work_on(w->sim, w->span, begin, end < n ? end : n, end < n ? end : begin, w->work,
+                    &w->sim->results[i]);
         }
     }
+}
+
+static size_t for_chunks(struct particles_work *w) {
+    const size_t n_chunks = n_chunks_of(w);
+    const int n_parts = w->sim->team->n_threads;
+    for (int k = 0; k < n_parts; k++) {
+        atomic_store(&w->sim->turns[k].next[0], n_chunks * (size_t)k / (size_t)n_parts);
+    }
+    mpm_team_run(w->sim->team, work_on_chunks, w);
     return n_chunks;
 }
 
@@ -162,11 +169,12 @@ static void for_particles(const struct mpm_sim *sim, size_t body, struct mpm_spa
                           span_work *work, struct mpm_span_result *joined) {
     span.s = &sim->sets[body];
     span.grid = (struct mpm_grid *)&sim->grid;
+    struct particles_work w = {sim, &sim->orders[body], span, work};
     size_t n = sim->orders[body].n_tiles;
     if (adds) {
-        for_tiles(sim, body, span, work);
+        for_tiles(&w);
     } else {
-        n = for_chunks(sim, span, work);
+        n = for_chunks(&w);
     }
     for (size_t k = 0; k < n; k++) {
         join(joined, &sim->results[k], span.s);
@@ -339,7 +347,7 @@ static bool sort_is_due(const struct mpm_clockwork *c) {
 // eqs. 7, 8, 10, and the forces of loads and rigid bodies.
 static void particles_to_grid(struct mpm_sim *sim, double dt, bool any_fbar, double *clock) {
     struct mpm_span_result found = mpm_nothing_found();
-    clear_nodes(&sim->grid, any_fbar, sim->def->n_threads);
+    mpm_team_run(sim->team, clear_nodes, &(struct nodes_work){.sim = sim, .fbar = any_fbar});
     for (size_t b = 0; b < sim->n_sets; b++) {
         const struct mpm_span span = {.dt = dt, .fbar = any_fbar && sim->sets[b].wants_fbar};
         for_particles(sim, b, span, true, p2g, &found);
@@ -380,9 +388,9 @@ static bool takes_part_in_fbar(const struct mpm_sim *sim) {
     return any && sim->c.now.fbar.scheme != MPM_FBAR_OFF;
 }
 
-enum mpm_status mpm_step(struct mpm_sim *sim, struct mpm_error *err) {
+static enum mpm_status step(struct mpm_sim *sim, struct mpm_error *err) {
     const struct mpm_settings *now = &sim->c.now;
-    const int dim = sim->grid.dim, n_threads = sim->def->n_threads;
+    const int dim = sim->grid.dim;
     const double dt = mpm_next_dt(sim), time = sim->c.time + dt;
     const double cfl = dt * (mpm_wave_speed(sim) + mpm_largest_speed(sim)) / sim->grid.h;
     if (cfl > UNSTABLE_CFL && !sim->def->unstable_ok) {
@@ -407,10 +415,12 @@ enum mpm_status mpm_step(struct mpm_sim *sim, struct mpm_error *err) {
 
     // Grid, eq. 9, and boundary conditions
     mpm_walls_fold(sim->walls, sim->n_walls, &sim->grid, gravity, dt);
-    move_nodes(sim, &(struct mpm_motion){.dt = dt,
-                                         .local = now->damping_local,
-                                         .mass = now->damping_mass,
-                                         .gravity = {gravity[0], gravity[1], gravity[2]}});
+    struct nodes_work motion = {.sim = sim,
+                                .motion = {.dt = dt,
+                                           .local = now->damping_local,
+                                           .mass = now->damping_mass,
+                                           .gravity = {gravity[0], gravity[1], gravity[2]}}};
+    mpm_team_run(sim->team, move_nodes, &motion);
     mpm_walls_apply(sim->walls, sim->n_walls, &sim->grid, gravity, dt);
     charge(sim, MPM_PHASE_GRID, &clock);
 
@@ -430,7 +440,7 @@ enum mpm_status mpm_step(struct mpm_sim *sim, struct mpm_error *err) {
 
     // F-bar, eqs. 20-27: Algorithm 1, steps 4 and 5
     if (any_fbar) {
-        mpm_fbar_average(&sim->grid, sim->walls, sim->n_walls, n_threads);
+        mpm_fbar_average(&sim->grid, sim->walls, sim->n_walls, sim->team);
         for (size_t b = 0; b < sim->n_sets; b++) {
             if (sim->sets[b].wants_fbar) {
                 const struct mpm_span span = {.fbar = true, .scheme = scheme, .C = now->fbar.C};
@@ -475,4 +485,21 @@ enum mpm_status mpm_step(struct mpm_sim *sim, struct mpm_error *err) {
     mpm_probes_after_step(sim, dt);
     leave_stage_if_over(sim);
     return MPM_OK;
+}
+
+struct step_call {
+    struct mpm_sim *sim;
+    struct mpm_error *err;
+    enum mpm_status status;
+};
+
+static void run_step(void *context) {
+    struct step_call *call = context;
+    call->status = step(call->sim, call->err);
+}
+
+enum mpm_status mpm_step(struct mpm_sim *sim, struct mpm_error *err) {
+    struct step_call call = {.sim = sim, .err = err};
+    mpm_team_hold(sim->team, run_step, &call); // its threads stand by for the parallel parts
+    return call.status;
 }

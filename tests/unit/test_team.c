@@ -1,0 +1,104 @@
+// Threads that stand by: each part is done once, what was written before is seen, and all meet.
+#include <setjmp.h>
+#include <stdarg.h>
+#include <stddef.h>
+#include <stdint.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include <cmocka.h>
+
+#include "server/mpm/team.h"
+
+#define MOST 7 // threads: more than most machines have cores, so that some wait in the kernel
+#define ROUNDS 300
+
+struct count {
+    struct mpm_team *team;
+    int there;
+    unsigned done[MOST]; // parts, by each thread
+    unsigned sum, given; // sum: of what all have read of `given`
+    unsigned read[MOST];
+};
+
+static void take_part(void *context, int own, int there) {
+    struct count *c = context;
+    c->done[own]++;
+    c->read[own] = c->given;
+    if (own == 0) {
+        c->there = there;
+    }
+    mpm_team_barrier(c->team, there);
+    if (own == there - 1) { // what all wrote before the barrier is there after it
+        for (int k = 0; k < there; k++) {
+            c->sum += c->read[k];
+        }
+    }
+    mpm_team_barrier(c->team, there);
+    c->read[own] = 0;
+}
+
+static void rounds(void *context) {
+    struct count *c = context;
+    for (unsigned k = 1; k <= ROUNDS; k++) {
+        c->given = k;
+        c->sum = 0;
+        mpm_team_run(c->team, take_part, c);
+        if (c->sum != k * (unsigned)c->there) {
+            fail_msg("round %u: %u of %d threads", k, c->sum, c->there);
+        }
+        for (int own = 0; own < c->there; own++) { // the end of the work is a barrier, too
+            assert_int_equal(c->read[own], 0);
+        }
+    }
+}
+
+static void test_team_does_each_part_once(void **state) {
+    (void)state;
+    for (int n = 1; n <= MOST; n += 3) {
+        struct mpm_team *team = aligned_alloc(64, sizeof *team);
+        mpm_team_create(team, n);
+        for (int held = 0; held < 2; held++) {
+            struct count c = {.team = team};
+            if (held) {
+                mpm_team_hold(team, rounds, &c);
+            } else {
+                rounds(&c); // each in a region of its own
+            }
+            assert_true(c.there >= 1 && c.there <= n);
+            for (int own = 0; own < MOST; own++) {
+                assert_int_equal(c.done[own], own < c.there ? ROUNDS : 0);
+            }
+        }
+        free(team);
+    }
+}
+
+static void hold_again(void *context) {
+    struct count *c = context;
+    c->given = 1;
+    mpm_team_run(c->team, take_part, c);
+}
+
+// A step after the other: what one leaves does not end or begin the next.
+static void test_team_can_be_held_again(void **state) {
+    (void)state;
+    struct mpm_team *team = aligned_alloc(64, sizeof *team);
+    mpm_team_create(team, 3);
+    struct count c = {.team = team};
+    for (int k = 0; k < ROUNDS; k++) {
+        mpm_team_hold(team, hold_again, &c);
+        assert_int_equal(c.done[0], k + 1);
+    }
+    free(team);
+}
+
+int main(int argc, char **argv) {
+    const struct CMUnitTest tests[] = {
+        cmocka_unit_test(test_team_does_each_part_once),
+        cmocka_unit_test(test_team_can_be_held_again),
+    };
+    cmocka_set_test_filter(argc > 1 ? argv[1] : NULL);
+    return cmocka_run_group_tests(tests, NULL, NULL);
+}
