@@ -49,8 +49,7 @@ static void row(struct mpm_sim *sim, int which, pass *work, struct mpm_span span
                 run(work, sim, span);
                 times++;
             } while (now() - begin < 0.01);
-            ns[bench_stages][r] =
-                1e9 * (now() - begin) / times / (double)mpm_n_particles(sim);
+            ns[bench_stages][r] = 1e9 * (now() - begin) / times / (double)mpm_n_particles(sim);
         }
     }
     printf("  %-6s %5.1f ns:", passes[which].name, median(ns[n], rounds));
@@ -95,7 +94,9 @@ void stages_of(struct mpm_sim *sim) {
         memset(sim->grid.fbar, 0, nodes * (size_t)sim->grid.fbar_stride * sizeof(double));
         run(sim->kernels->p2g, sim, span);
         run(sim->kernels->g2p, sim, span);
-        mpm_fbar_average(&sim->grid, sim->walls, sim->n_walls, sim->team);
+        mpm_walls_fold_fbar(sim->walls, sim->n_walls, &sim->grid);
+        mpm_fbar_divide(&sim->grid, 1, sim->grid.n_slots);
+        mpm_walls_mirror_fbar(sim->walls, sim->n_walls, &sim->grid);
         row(sim, 2, kernels->fbar, span);
     }
 }

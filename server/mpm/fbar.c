@@ -9,26 +9,15 @@ int mpm_fbar_scalars(enum mpm_fbar_scheme scheme) {
     return scheme == MPM_FBAR_OFF ? 0 : scheme == MPM_FBAR_ZHAO ? 1 : 2;
 }
 
-// Sums become averages.
-static void divide(void *context, int own, int there) {
-    const struct mpm_grid *grid = context;
+void mpm_fbar_divide(struct mpm_grid *grid, uint32_t begin, uint32_t end) {
     const size_t scalars = (size_t)grid->fbar_stride, nodes = (size_t)MPM_BLOCK_NODES(grid->dim);
     const size_t volume = (size_t)MPM_NODE_VOLUME(grid->dim);
-    uint32_t begin, end;
-    mpm_grid_part(grid, own, there, &begin, &end);
     for (size_t i = begin * nodes; i < end * nodes; i++) {
         const double V = grid->node[i * MPM_NODE + volume];
         for (size_t k = 0; V > 0 && k < scalars; k++) {
             grid->fbar[i * scalars + k] /= V;
         }
     }
-}
-
-void mpm_fbar_average(struct mpm_grid *grid, const struct mpm_wall *walls, size_t n_walls,
-                      struct mpm_team *team) {
-    mpm_walls_fold_fbar(walls, n_walls, grid);
-    mpm_team_run(team, divide, grid);
-    mpm_walls_mirror_fbar(walls, n_walls, grid);
 }
 
 double mpm_fbar_drift(const struct mpm_particles *s) {

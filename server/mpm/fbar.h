@@ -2,13 +2,12 @@
 #pragma once
 #include "server/mpm/boundary.h"
 #include "server/mpm/particles.h"
-#include "server/mpm/team.h"
 
 // Sums besides V that a scheme averages: 0, 1 or 2.
 int mpm_fbar_scalars(enum mpm_fbar_scheme scheme);
-// Between scatter and finish: sums become averages; a node without volume stays out.
-void mpm_fbar_average(struct mpm_grid *grid, const struct mpm_wall *walls, size_t n_walls,
-                      struct mpm_team *team);
+// Between scatter and finish, once walls have folded: sums become averages, in the grid's slots
+// [begin, end); a node without volume stays out.
+void mpm_fbar_divide(struct mpm_grid *grid, uint32_t begin, uint32_t end);
 // max |ln(J/Jbar)| over the particles of one body: how far the volume that forces use (or, for a
 // fluid under F-bar, its raw volume ratio) has come from the ratio that stress uses. Infinite when
 // a raw ratio is not positive.

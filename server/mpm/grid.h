@@ -70,14 +70,6 @@ bool mpm_grid_connect(struct mpm_grid *grid);
 // Coordinates of a block of the domain.
 void mpm_grid_block_place(const struct mpm_grid *grid, uint32_t block, int *place);
 
-// The slots [begin, end) of part k of n; slot 0, where no block is, belongs to none.
-static inline void mpm_grid_part(const struct mpm_grid *g, int k, int n, uint32_t *begin,
-                                 uint32_t *end) {
-    const uint64_t all = g->n_slots - 1;
-    *begin = 1 + (uint32_t)(all * (uint64_t)k / (uint64_t)n);
-    *end = 1 + (uint32_t)(all * (uint64_t)(k + 1) / (uint64_t)n);
-}
-
 // The node number of (i, j, k); in slot 0 where its block does not exist.
 static inline uint32_t mpm_node_at(const struct mpm_grid *g, const int *place) {
     uint32_t block = 0, in = 0;

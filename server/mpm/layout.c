@@ -10,8 +10,8 @@ static bool lay_out(struct mpm_sim *sim) {
     mpm_grid_deactivate(&sim->grid);
     size_t most = 0;
     for (size_t b = 0; b < sim->n_sets; b++) {
-        mpm_order_colour(&sim->orders[b], &sim->grid, basis);
-        if (!mpm_order_activate(&sim->orders[b], &sim->grid, basis)) {
+        if (!mpm_order_colour(&sim->orders[b], &sim->grid, basis) ||
+            !mpm_order_activate(&sim->orders[b], &sim->grid, basis)) {
             return false;
         }
         const size_t tiles = sim->orders[b].n_tiles, chunks = sim->sets[b].n / MPM_CHUNK + 1;

@@ -39,26 +39,38 @@ void mpm_sorter_free(struct mpm_sorter *sorter) {
 
 void mpm_order_free(struct mpm_order *order) {
     free(order->tile);
-    free(order->by_colour);
+    free(order->colour);
+    free(order->before_begin);
+    free(order->before);
     free(order->work_before);
+    free(order->done);
+    free(order->share);
     *order = (struct mpm_order){0};
+}
+
+// What is there is kept. False when memory is short.
+static bool resize(void *array, size_t bytes) {
+    void *moved = realloc(*(void **)array, bytes);
+    if (moved) {
+        *(void **)array = moved;
+    }
+    return moved != NULL;
 }
 
 bool mpm_order_reserve(struct mpm_order *order, size_t n) {
     if (n <= order->capacity) {
         return true;
     }
-    const size_t capacity = n + n / 2 + 8;
-    struct mpm_tile *tile = realloc(order->tile, capacity * sizeof *tile);
-    order->tile = tile ? tile : order->tile;
-    uint32_t *by_colour = realloc(order->by_colour, capacity * sizeof *by_colour);
-    order->by_colour = by_colour ? by_colour : order->by_colour;
-    uint64_t *work_before = realloc(order->work_before, (capacity + 1) * sizeof *work_before);
-    order->work_before = work_before ? work_before : order->work_before;
-    if (tile && by_colour && work_before) {
-        order->capacity = capacity;
+    const size_t room = n + n / 2 + 8;
+    if (!resize(&order->tile, room * sizeof *order->tile) || !resize(&order->colour, room) ||
+        !resize(&order->before_begin, (room + 1) * sizeof *order->before_begin) ||
+        !resize(&order->work_before, (room + 1) * sizeof *order->work_before) ||
+        !resize(&order->done, room * sizeof *order->done) ||
+        !resize(&order->share, room * sizeof *order->share)) {
+        return false;
     }
-    return tile && by_colour && work_before;
+    order->capacity = room;
+    return true;
 }
 
 // The part of n that part k of n_parts takes.
@@ -230,33 +242,121 @@ static int colours_along(enum mpm_basis basis) {
     return basis == MPM_BSPLINE3 ? 3 : 2;
 }
 
-void mpm_order_colour(struct mpm_order *order, const struct mpm_grid *grid, enum mpm_basis basis) {
-    const int along = colours_along(basis);
-    order->n_colours = grid->dim == 2 ? along * along : along * along * along;
-    size_t n = 0;
-    for (int colour = 0; colour < order->n_colours; colour++) {
-        order->colour_begin[colour] = n;
-        for (size_t k = 0; k < order->n_tiles; k++) {
-            int place[MPM_MAX_DIM], its = 0;
-            mpm_grid_block_place(grid, order->tile[k].block, place);
-            for (int d = 0; d < grid->dim; d++) {
-                its = its * along + place[d] % along;
-            }
-            if (its == colour) {
-                order->by_colour[n++] = (uint32_t)k;
+// For all tiles at an offset, in blocks, from another one: how many of lower colour there are near
+// each (before_begin[t + 1]), or, to `write`, which (before[before_begin[t]++]). Tiles ascend by
+// block, and so do the blocks at one offset from them.
+static void find_before(struct mpm_order *order, const struct mpm_grid *grid, const int *offset,
+                        bool write) {
+    int64_t distance = 0;
+    for (int d = 0; d < grid->dim; d++) {
+        distance = distance * grid->n_blocks[d] + offset[d];
+    }
+    size_t other = 0;
+    for (size_t t = 0; t < order->n_tiles; t++) {
+        int place[MPM_MAX_DIM];
+        bool inside = true;
+        mpm_grid_block_place(grid, order->tile[t].block, place);
+        for (int d = 0; d < grid->dim; d++) {
+            inside &= place[d] + offset[d] >= 0 && place[d] + offset[d] < (int)grid->n_blocks[d];
+        }
+        if (!inside) {
+            continue;
+        }
+        const int64_t block = order->tile[t].block + distance;
+        while (other < order->n_tiles && order->tile[other].block < block) {
+            other++;
+        }
+        if (other < order->n_tiles && order->tile[other].block == block &&
+            order->colour[other] < order->colour[t]) {
+            if (write) {
+                order->before[order->before_begin[t]++] = (uint32_t)other;
+            } else {
+                order->before_begin[t + 1]++;
             }
         }
     }
-    order->colour_begin[order->n_colours] = n;
+}
+
+bool mpm_order_colour(struct mpm_order *order, const struct mpm_grid *grid, enum mpm_basis basis) {
+    const int along = colours_along(basis), dim = grid->dim, width = 2 * along - 1;
+    order->n_colours = dim == 2 ? along * along : along * along * along;
+    order->n_parts = 0;
+    if (order->n_tiles == 0) {
+        return true;
+    }
     uint64_t work = 0;
-    for (size_t k = 0; k < n; k++) {
-        const struct mpm_tile *tile = &order->tile[order->by_colour[k]];
-        order->work_before[k] = work;
-        work += tile->end - tile->begin + TILE_WORK;
+    for (size_t t = 0; t < order->n_tiles; t++) {
+        int place[MPM_MAX_DIM], colour = 0;
+        mpm_grid_block_place(grid, order->tile[t].block, place);
+        for (int d = 0; d < dim; d++) {
+            colour = colour * along + place[d] % along;
+        }
+        order->colour[t] = (uint8_t)colour;
+        order->work_before[t] = work;
+        work += order->tile[t].end - order->tile[t].begin + TILE_WORK;
+        atomic_init(&order->done[t], order->pass);
     }
-    if (order->work_before) { // else there are no tiles
-        order->work_before[n] = work;
+    order->work_before[order->n_tiles] = work;
+    memset(order->before_begin, 0, (order->n_tiles + 1) * sizeof *order->before_begin);
+    for (int write = 0; write < 2; write++) { // first their numbers, then they themselves
+        for (int k = 0; k < (dim == 2 ? width * width : width * width * width); k++) {
+            int offset[MPM_MAX_DIM];
+            for (int d = dim, rest = k; d-- > 0; rest /= width) {
+                offset[d] = rest % width - (along - 1);
+            }
+            find_before(order, grid, offset, write);
+        }
+        if (write) { // each begin has moved on to the next one's
+            memmove(order->before_begin + 1, order->before_begin,
+                    order->n_tiles * sizeof *order->before_begin);
+            order->before_begin[0] = 0;
+            break;
+        }
+        for (size_t t = 0; t < order->n_tiles; t++) {
+            order->before_begin[t + 1] += order->before_begin[t];
+        }
+        const size_t n = order->before_begin[order->n_tiles];
+        if (n > order->before_capacity) {
+            if (!resize(&order->before, (n + n / 2) * sizeof *order->before)) {
+                return false;
+            }
+            order->before_capacity = n + n / 2;
+        }
     }
+    return true;
+}
+
+size_t mpm_order_part(const struct mpm_order *order, int k, int n) {
+    const uint64_t wanted =
+        order->n_tiles == 0 ? 0 : order->work_before[order->n_tiles] * (uint64_t)k / (uint64_t)n;
+    size_t lo = 0, hi = order->n_tiles;
+    while (lo < hi) { // the first tile with at least so much before it
+        const size_t middle = lo + (hi - lo) / 2;
+        if (order->work_before[middle] < wanted) {
+            lo = middle + 1;
+        } else {
+            hi = middle;
+        }
+    }
+    return lo;
+}
+
+void mpm_order_share(struct mpm_order *order, int n) {
+    for (int k = 0; k < n; k++) {
+        const size_t begin = mpm_order_part(order, k, n), end = mpm_order_part(order, k + 1, n);
+        size_t next[MPM_MAX_COLOURS + 1] = {0};
+        for (size_t t = begin; t < end; t++) {
+            next[order->colour[t] + 1]++;
+        }
+        next[0] = begin;
+        for (int colour = 0; colour < order->n_colours; colour++) {
+            next[colour + 1] += next[colour];
+        }
+        for (size_t t = begin; t < end; t++) {
+            order->share[next[order->colour[t]]++] = (uint32_t)t;
+        }
+    }
+    order->n_parts = n;
 }
 
 // The nodes that a particle of a cell can reach while it drifts by less than a cell are

@@ -3,10 +3,13 @@
 //
 // A tile is the particles of one block at the time of the last sort. Until the next one none of
 // them may drift by a whole cell: then tiles that are two blocks apart (three with cubic B-splines)
-// reach no common node, and those of one colour can add to the grid at the same time, without
-// atomics and in an order that no thread count changes. Within a tile a stale order costs speed
-// only: kernels look at each particle's cell.
+// reach no common node. Tiles have colours, such that those of one colour are so far apart. A tile
+// may add to the grid once those of lower colours near it have: so no two threads add to a node at
+// the same time, and each node's sum has one order, whatever the number of threads. Within a tile a
+// stale order costs speed only: kernels look at each particle's cell.
 #pragma once
+#include <stdatomic.h>
+
 #include "server/mpm/grid.h"
 #include "server/mpm/particles.h"
 #include "server/mpm/team.h"
@@ -23,10 +26,19 @@ struct mpm_tile {
 struct mpm_order {
     size_t n_tiles, capacity;
     struct mpm_tile *tile; // by block
-    uint32_t *by_colour;   // tiles by colour
-    uint64_t *work_before; // (n_tiles + 1) of by_colour: particles, and what a tile costs besides
-    size_t colour_begin[MPM_MAX_COLOURS + 1]; // of by_colour; n_colours + 1 in use
+    uint8_t *colour;       // (n_tiles)
     int n_colours;
+    uint32_t *before_begin, *before; // of tile t [before_begin[t], before_begin[t + 1]) of the
+                                     // tiles near it with lower colours
+    size_t before_capacity;
+    uint64_t
+        *work_before;  // (n_tiles + 1) particles of the tiles before, and what tiles cost besides
+    atomic_uint *done; // (n_tiles) the pass in which a tile has last been done
+    unsigned pass;
+    // The tiles in parts of about equal work, each of them by colour: shares [mpm_order_part(k),
+    // mpm_order_part(k + 1)) are part k of n_parts (0: not shared out yet).
+    uint32_t *share;
+    int n_parts;
 };
 
 // Memory for sorting any body of up to n particles.
@@ -48,8 +60,13 @@ bool mpm_order_reserve(struct mpm_order *order, size_t n);
 // sorted, and the order must not be used.
 bool mpm_order_sort(struct mpm_order *order, struct mpm_particles *s, const struct mpm_grid *grid,
                     enum mpm_basis basis, struct mpm_sorter *sorter);
-// Sorts the tiles by colour: after they were found or restored.
-void mpm_order_colour(struct mpm_order *order, const struct mpm_grid *grid, enum mpm_basis basis);
+// Gives the tiles their colours and finds what they wait for: after they were found or restored.
+// False when memory is short.
+bool mpm_order_colour(struct mpm_order *order, const struct mpm_grid *grid, enum mpm_basis basis);
+// Shares the tiles out in n parts.
+void mpm_order_share(struct mpm_order *order, int n);
+// Where part k of n begins; n ends the last.
+size_t mpm_order_part(const struct mpm_order *order, int k, int n);
 // Gives every block that particles of the tiles can reach before the next sort its slot. False when
 // memory is short.
 bool mpm_order_activate(const struct mpm_order *order, struct mpm_grid *grid, enum mpm_basis basis);

@@ -43,9 +43,12 @@ struct mpm_clockwork {
     uint64_t runs_at_sort, runs; // particles of one cell in a row: after the sort, and now
 };
 
-// Which tile of a thread's part is next, of this colour and the next one; a cache line for each.
+// Which tile or chunk of a thread's part is next, where the part ends, and which slots of the grid
+// are its part of the nodes; a cache line for each.
 struct mpm_turn {
-    _Alignas(64) atomic_size_t next[2];
+    _Alignas(64) atomic_size_t next;
+    size_t end;
+    uint32_t first_slot, last_slot; // [first, last)
 };
 
 struct mpm_sim {
@@ -87,11 +90,11 @@ double mpm_wave_speed(const struct mpm_sim *sim);
 double mpm_largest_speed(const struct mpm_sim *sim); // of particles and rigid bodies, m/s
 // The stability limit for a stage of a definition, with the bodies' initial speeds, s.
 double mpm_def_dt_limit(const struct mpm_def *def, size_t stage);
-// Whether settings are in their bounds; `pointer` is the place of the settings, dt_limit in s, and cfl_limit
-// that of a CFL number.
+// Whether settings are in their bounds; `pointer` is the place of the settings, dt_limit in s, and
+// cfl_limit that of a CFL number.
 enum mpm_status mpm_check_settings(const struct mpm_settings *settings, const char *pointer,
-                                   int dim, double dt_limit, double cfl_limit,
-                                   bool unstable_ok, struct mpm_error *err);
+                                   int dim, double dt_limit, double cfl_limit, bool unstable_ok,
+                                   struct mpm_error *err);
 // Applies what stage `stage` states, removes and resets, and sets the clock to its start.
 void mpm_enter_stage(struct mpm_sim *sim, size_t stage);
 double mpm_kinetic_energy(const struct mpm_sim *sim);

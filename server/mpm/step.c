@@ -10,33 +10,62 @@
 #define UNSTABLE_CFL                                                                               \
     1.0 // no basis is stable at dt >= 0.9 h/c (docs/method.md): beyond this it is not tried
 
+// Work on nodes. Each thread has the blocks around its part of the tiles, so that most of what it
+// adds to the grid, moves and gathers stays with it: to fetch what another core has just changed
+// takes longer than all else that is done with a node.
 struct nodes_work {
-    const struct mpm_sim *sim;
+    struct mpm_sim *sim;
     struct mpm_motion motion;
     bool fbar;
 };
 
-static void move_nodes(void *context, int own, int there) {
-    const struct nodes_work *w = context;
-    uint32_t begin, end;
-    mpm_grid_part(&w->sim->grid, own, there, &begin, &end);
-    if (begin < end) {
-        w->sim->kernels->move_nodes(&w->sim->grid, begin, end, &w->motion);
+static void share_nodes(struct mpm_sim *sim) {
+    const int n = sim->team->n_there;
+    size_t most = 0;
+    for (size_t b = 1; b < sim->n_sets; b++) {
+        most = sim->sets[b].n > sim->sets[most].n ? b : most;
+    }
+    const struct mpm_order *order = &sim->orders[most];
+    uint32_t slot = 0;
+    for (int k = 0; k < n; k++) {
+        sim->turns[k].first_slot = slot;
+        const size_t t = k + 1 < n ? mpm_order_part(order, k + 1, n) : order->n_tiles;
+        const uint32_t cut =
+            t < order->n_tiles ? sim->grid.slot[order->tile[t].block] : sim->grid.n_slots;
+        slot = cut > slot ? cut : slot;
+        sim->turns[k].last_slot = slot;
     }
 }
 
+// Slot 0, where no block is, is only cleared.
 static void clear_nodes(void *context, int own, int there) {
     const struct nodes_work *w = context;
     const struct mpm_grid *grid = &w->sim->grid;
+    const struct mpm_turn *part = &w->sim->turns[own];
     const size_t nodes = (size_t)MPM_BLOCK_NODES(grid->dim), scalars = (size_t)grid->fbar_stride;
-    uint32_t begin, end;
-    mpm_grid_part(grid, own, there, &begin, &end);
-    begin -= own == 0; // slot 0 as well
-    const size_t first = begin * nodes, n = (end - begin) * nodes;
+    const size_t first = part->first_slot * nodes, n = part->last_slot * nodes - first;
+    (void)there;
     memset(grid->node + first * MPM_NODE, 0, n * MPM_NODE * sizeof(double));
     if (w->fbar) {
         memset(grid->fbar + first * scalars, 0, n * scalars * sizeof(double));
     }
+}
+
+static void move_nodes(void *context, int own, int there) {
+    const struct nodes_work *w = context;
+    const struct mpm_turn *part = &w->sim->turns[own];
+    const uint32_t first = part->first_slot > 0 ? part->first_slot : 1;
+    (void)there;
+    if (first < part->last_slot) {
+        w->sim->kernels->move_nodes(&w->sim->grid, first, part->last_slot, &w->motion);
+    }
+}
+
+static void divide_nodes(void *context, int own, int there) {
+    struct mpm_sim *sim = context;
+    const struct mpm_turn *part = &sim->turns[own];
+    (void)there;
+    mpm_fbar_divide(&sim->grid, part->first_slot > 0 ? part->first_slot : 1, part->last_slot);
 }
 
 static void join(struct mpm_span_result *joined, const struct mpm_span_result *r,
@@ -67,86 +96,76 @@ static void work_on(const struct mpm_sim *sim, struct mpm_span span, size_t begi
     work(sim, &span, result);
 }
 
-// The first of a colour's tiles that belongs to part k of n: parts hold about as many particles,
-// and lie apart, so that most of the grid that a thread adds to stays with it from colour to
-// colour.
-static size_t part_begin(const struct mpm_order *order, int colour, int k, int n) {
-    size_t lo = order->colour_begin[colour], hi = order->colour_begin[colour + 1];
-    const size_t first = order->work_before[lo], all = order->work_before[hi] - first;
-    const size_t wanted = first + all * (size_t)k / (size_t)n;
-    while (lo < hi) { // the first with at least so much before it
-        const size_t middle = lo + (hi - lo) / 2;
-        if (order->work_before[middle] < wanted) {
-            lo = middle + 1;
-        } else {
-            hi = middle;
-        }
-    }
-    return lo;
-}
-
-// Work that adds to the grid goes tile by tile and colour by colour: tiles of one colour reach no
-// common node, and those of the next wait for them, so that every node's sum has one order whatever
-// the number of threads.
 struct particles_work {
     const struct mpm_sim *sim;
-    const struct mpm_order *order;
+    struct mpm_order *order;
     struct mpm_span span;
     span_work *work;
+    int n_parts; // one a thread
 };
 
+// The next of a part, if there is one. Of another's part only while more than one is left: what
+// lies in another core's cache takes longer to fetch than to work on.
+static bool take(struct mpm_turn *turn, bool own, size_t *next) {
+    if (!own && atomic_load_explicit(&turn->next, memory_order_relaxed) + 1 >= turn->end) {
+        return false;
+    }
+    *next = atomic_fetch_add(&turn->next, 1);
+    return *next < turn->end;
+}
+
+// Work that adds to the grid goes tile by tile. A tile waits for those near it with lower colours,
+// so that every node's sum has one order whatever the number of threads (order.h). Each thread does
+// its own part of the tiles first, by colour, then what others have not begun. Nobody waits for a
+// tile that nobody will do: of all that are being done, the one with the lowest colour waits for
+// none that is, and a part's next is always done or taken by the one whose part it is.
 static void work_on_tiles(void *context, int own, int there) {
     const struct particles_work *w = context;
     const struct mpm_order *order = w->order;
-    struct mpm_turn *turns = w->sim->turns;
-    const int n_parts = w->sim->team->n_threads;
-    for (int colour = 0; colour < order->n_colours; colour++) {
-        // First one's own part, then what others have not begun.
-        for (int k = 0; k < n_parts; k++) {
-            const int part = (own + k) % n_parts;
-            const size_t end = part_begin(order, colour, part + 1, n_parts);
-            atomic_size_t *turn = &turns[part].next[colour % 2];
-            for (size_t i; (i = atomic_fetch_add(turn, 1)) < end;) {
-                const size_t t = order->by_colour[i];
-                const size_t next = i + 1 < order->n_tiles ? order->by_colour[i + 1] : t;
-                work_on(w->sim, w->span, order->tile[t].begin, order->tile[t].end,
-                        order->tile[next].begin, w->work, &w->sim->results[t]);
+    struct mpm_team *team = w->sim->team;
+    for (int k = 0; k < w->n_parts; k++) {
+        struct mpm_turn *turn = &w->sim->turns[(own + k) % w->n_parts];
+        for (size_t i; take(turn, k == 0, &i);) {
+            const uint32_t t = order->share[i], next = order->share[i + 1 < turn->end ? i + 1 : i];
+            for (uint32_t q = order->before_begin[t]; there > 1 && q < order->before_begin[t + 1];
+                 q++) {
+                atomic_uint *done = &order->done[order->before[q]];
+                for (unsigned pass; (pass = atomic_load(done)) != order->pass;) {
+                    mpm_team_await(team, done, pass);
+                }
+            }
+            work_on(w->sim, w->span, order->tile[t].begin, order->tile[t].end,
+                    order->tile[next].begin, w->work, &w->sim->results[t]);
+            if (there > 1) {
+                atomic_store(&order->done[t], order->pass);
+                mpm_team_tell(team, &order->done[t]);
             }
         }
-        if (colour + 1 == order->n_colours) {
-            break; // the end of the work is a barrier, too
-        }
-        for (int part = own; part < n_parts; part += there) {
-            atomic_store(&turns[part].next[(colour + 1) % 2],
-                         part_begin(order, colour + 1, part, n_parts));
-        }
-        mpm_team_barrier(w->sim->team, there);
     }
 }
 
 static void for_tiles(struct particles_work *w) {
-    const int n_parts = w->sim->team->n_threads;
+    const int n_parts = w->n_parts;
+    if (w->order->n_parts != n_parts) {
+        mpm_order_share(w->order, n_parts);
+    }
+    w->order->pass++;
     for (int k = 0; k < n_parts; k++) {
-        atomic_store(&w->sim->turns[k].next[0], part_begin(w->order, 0, k, n_parts));
+        atomic_store(&w->sim->turns[k].next, mpm_order_part(w->order, k, n_parts));
+        w->sim->turns[k].end = mpm_order_part(w->order, k + 1, n_parts);
     }
     mpm_team_run(w->sim->team, work_on_tiles, w);
 }
 
-// All other work goes in chunks of equal size. They do not take equal time, since what flows costs
-// more: first one's own part, as with tiles, then what others have not begun.
-static size_t n_chunks_of(const struct particles_work *w) {
-    return (w->span.s->n + MPM_CHUNK - 1) / MPM_CHUNK;
-}
-
+// All other work goes in chunks of equal size, in the same parts to a chunk, so that particles stay
+// with their core. They do not take equal time, since what flows costs more.
 static void work_on_chunks(void *context, int own, int there) {
     const struct particles_work *w = context;
-    const size_t n = w->span.s->n, n_chunks = n_chunks_of(w);
-    const int n_parts = w->sim->team->n_threads;
+    const size_t n = w->span.s->n;
     (void)there;
-    for (int k = 0; k < n_parts; k++) {
-        const int part = (own + k) % n_parts;
-        const size_t part_end = n_chunks * (size_t)(part + 1) / (size_t)n_parts;
-        for (size_t i; (i = atomic_fetch_add(&w->sim->turns[part].next[0], 1)) < part_end;) {
+    for (int k = 0; k < w->n_parts; k++) {
+        struct mpm_turn *turn = &w->sim->turns[(own + k) % w->n_parts];
+        for (size_t i; take(turn, k == 0, &i);) {
             const size_t begin = i * MPM_CHUNK, end = begin + MPM_CHUNK;
             work_on(w->sim, w->span, begin, end < n ? end : n, end < n ? end : begin, w->work,
                     &w->sim->results[i]);
@@ -155,10 +174,15 @@ static void work_on_chunks(void *context, int own, int there) {
 }
 
 static size_t for_chunks(struct particles_work *w) {
-    const size_t n_chunks = n_chunks_of(w);
-    const int n_parts = w->sim->team->n_threads;
-    for (int k = 0; k < n_parts; k++) {
-        atomic_store(&w->sim->turns[k].next[0], n_chunks * (size_t)k / (size_t)n_parts);
+    const size_t n_chunks = (w->span.s->n + MPM_CHUNK - 1) / MPM_CHUNK;
+    size_t begin = 0;
+    for (int k = 0; k < w->n_parts; k++) {
+        const size_t tile = mpm_order_part(w->order, k + 1, w->n_parts);
+        const size_t end = tile < w->order->n_tiles
+                               ? (w->order->tile[tile].begin + MPM_CHUNK / 2) / MPM_CHUNK
+                               : n_chunks;
+        atomic_store(&w->sim->turns[k].next, begin);
+        begin = w->sim->turns[k].end = end;
     }
     mpm_team_run(w->sim->team, work_on_chunks, w);
     return n_chunks;
@@ -169,7 +193,7 @@ static void for_particles(const struct mpm_sim *sim, size_t body, struct mpm_spa
                           span_work *work, struct mpm_span_result *joined) {
     span.s = &sim->sets[body];
     span.grid = (struct mpm_grid *)&sim->grid;
-    struct particles_work w = {sim, &sim->orders[body], span, work};
+    struct particles_work w = {sim, &sim->orders[body], span, work, sim->team->n_there};
     size_t n = sim->orders[body].n_tiles;
     if (adds) {
         for_tiles(&w);
@@ -347,6 +371,7 @@ static bool sort_is_due(const struct mpm_clockwork *c) {
 // eqs. 7, 8, 10, and the forces of loads and rigid bodies.
 static void particles_to_grid(struct mpm_sim *sim, double dt, bool any_fbar, double *clock) {
     struct mpm_span_result found = mpm_nothing_found();
+    share_nodes(sim);
     mpm_team_run(sim->team, clear_nodes, &(struct nodes_work){.sim = sim, .fbar = any_fbar});
     for (size_t b = 0; b < sim->n_sets; b++) {
         const struct mpm_span span = {.dt = dt, .fbar = any_fbar && sim->sets[b].wants_fbar};
@@ -440,7 +465,9 @@ static enum mpm_status step(struct mpm_sim *sim, struct mpm_error *err) {
 
     // F-bar, eqs. 20-27: Algorithm 1, steps 4 and 5
     if (any_fbar) {
-        mpm_fbar_average(&sim->grid, sim->walls, sim->n_walls, sim->team);
+        mpm_walls_fold_fbar(sim->walls, sim->n_walls, &sim->grid);
+        mpm_team_run(sim->team, divide_nodes, sim);
+        mpm_walls_mirror_fbar(sim->walls, sim->n_walls, &sim->grid);
         for (size_t b = 0; b < sim->n_sets; b++) {
             if (sim->sets[b].wants_fbar) {
                 const struct mpm_span span = {.fbar = true, .scheme = scheme, .C = now->fbar.C};

@@ -23,15 +23,15 @@ static void pause_a_moment(void) {
 #endif
 }
 
-// Until the word is another one.
-static void await(struct mpm_team *team, atomic_uint *word, unsigned old) {
+void mpm_team_await(struct mpm_team *team, atomic_uint *word, unsigned old) {
     for (int k = 0; k < LOOKS; k++) {
         if (atomic_load_explicit(word, memory_order_acquire) != old) {
             return;
         }
         pause_a_moment();
     }
-    // In this order, with change() in the opposite one: either it sees a sleeper or we its change.
+    // In this order, with mpm_team_tell() in the opposite one: either it sees a sleeper or we its
+    // change.
     atomic_fetch_add(&team->asleep, 1);
     while (atomic_load(word) == old) {
 #ifdef __linux__
@@ -43,8 +43,7 @@ static void await(struct mpm_team *team, atomic_uint *word, unsigned old) {
     atomic_fetch_sub(&team->asleep, 1);
 }
 
-// The word has been changed.
-static void tell(struct mpm_team *team, atomic_uint *word) {
+void mpm_team_tell(struct mpm_team *team, atomic_uint *word) {
 #ifdef __linux__
     if (atomic_load(&team->asleep) > 0) {
         syscall(SYS_futex, word, FUTEX_WAKE_PRIVATE, INT_MAX, NULL, NULL, 0);
@@ -65,30 +64,30 @@ void mpm_team_barrier(struct mpm_team *team, int there) {
     }
     const unsigned meeting = atomic_load_explicit(&team->meeting, memory_order_relaxed);
     if (atomic_fetch_add(&team->met, 1) + 1 < (unsigned)there) {
-        await(team, &team->meeting, meeting);
+        mpm_team_await(team, &team->meeting, meeting);
         return;
     }
     atomic_store_explicit(&team->met, 0, memory_order_relaxed);
     atomic_fetch_add(&team->meeting, 1);
-    tell(team, &team->meeting);
+    mpm_team_tell(team, &team->meeting);
 }
 
 static void serve(struct mpm_team *team, unsigned round, int own, int there) {
     for (;;) {
-        await(team, &team->round, round++);
+        mpm_team_await(team, &team->round, round++);
         if (team->over) {
             return;
         }
         team->work(team->context, own, there);
         if (atomic_fetch_sub(&team->at_work, 1) == 1) {
-            tell(team, &team->at_work);
+            mpm_team_tell(team, &team->at_work);
         }
     }
 }
 
 static void next_round(struct mpm_team *team) {
     atomic_fetch_add(&team->round, 1);
-    tell(team, &team->round);
+    mpm_team_tell(team, &team->round);
 }
 
 void mpm_team_hold(struct mpm_team *team, void (*body)(void *context), void *context) {
@@ -123,7 +122,7 @@ void mpm_team_run(struct mpm_team *team, mpm_team_work *work, void *context) {
         next_round(team);
         work(context, 0, team->n_there);
         for (unsigned left; (left = atomic_load(&team->at_work)) > 0;) {
-            await(team, &team->at_work, left);
+            mpm_team_await(team, &team->at_work, left);
         }
         return;
     }

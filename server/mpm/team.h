@@ -32,3 +32,6 @@ void mpm_team_hold(struct mpm_team *team, void (*body)(void *context), void *con
 void mpm_team_run(struct mpm_team *team, mpm_team_work *work, void *context);
 // Within such work: waits until all `there` have come here.
 void mpm_team_barrier(struct mpm_team *team, int there);
+// Within such work: waits until the word is not `old`; who changes it tells the team.
+void mpm_team_await(struct mpm_team *team, atomic_uint *word, unsigned old);
+void mpm_team_tell(struct mpm_team *team, atomic_uint *word);

@@ -155,7 +155,7 @@ static void step_with_affine_velocity(struct mpm_sim *sim, const double *A) {
     struct mpm_span_result result;
     sim->kernels->p2g(&span, &result);
     sim->kernels->g2p(&span, &result);
-    mpm_fbar_average(g, NULL, 0, sim->team);
+    mpm_fbar_divide(g, 1, g->n_slots);
     sim->kernels->fbar(&span, &result);
     assert_true(result.bad == SIZE_MAX);
 }
