@@ -4,6 +4,7 @@ import os
 import signal
 import struct
 import subprocess
+import threading
 import time
 
 import pytest
@@ -256,6 +257,44 @@ def test_run_interrupted_pauses_the_run_of_a_shared_daemon(fake, start_fbar, tmp
         assert f"`fbar --url {daemon.url} resume r1`" in err and "Ctrl-C again leaves at once" in err
         assert not words or f"`fbar --url {daemon.url} record r1 -o a.h5`" in err
         daemon.requests.clear()
+
+
+@pytest.mark.parametrize("words", [["-o", "a.h5"], []])
+def test_a_second_interrupt_leaves_at_once(fake, fbar, start_fbar, tmp_path, words):
+    """Also while the daemon does not answer the first one's pause; what was recorded goes on from there."""
+    daemon, held = fake(), threading.Event()
+    daemon.advance(5, live=False)
+    route = daemon.route
+
+    def hold_pauses(method, path, body, headers):
+        answer = route(method, path, body, headers)
+        if path.endswith(":pause"):
+            held.wait(60)
+        return answer
+    daemon.route = hold_pauses
+    runner = start_fbar("run", "fake", *words, url=daemon.url)
+
+    def wait_for(condition):
+        end = time.monotonic() + 20
+        while not condition():
+            assert runner.poll() is None and time.monotonic() < end
+            time.sleep(0.01)
+    wait_for(lambda: any(p == "/v1/runs/r1" for _, p in daemon.requests) and (not words or 4 in daemon.acks))
+    runner.send_signal(signal.SIGINT)
+    wait_for(lambda: ("POST", "/v1/runs/r1:pause") in daemon.requests)
+    time.sleep(0.3)
+    assert runner.poll() is None  # it waits for the answer
+    runner.send_signal(signal.SIGINT)
+    began = time.monotonic()
+    out, err = runner.communicate(timeout=30)
+    assert runner.returncode == 130 and time.monotonic() - began < 5, err  # the answer would have come after 60 s
+    assert err.count("Ctrl-C again leaves at once") == 1
+    held.set()
+    if words:
+        daemon.state = "running"
+        daemon.advance(20 - daemon.ready, live=False)
+        assert fbar("record", "r1", "-o", "a.h5", url=daemon.url).returncode == 0
+        assert json.loads(fbar("--json", "info", "a.h5").stdout)["frames"] == 20
 
 
 # ---- Recordings -------------------------------------------------------------------------------------

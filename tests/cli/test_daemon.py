@@ -4,6 +4,7 @@ import os
 import pathlib
 import re
 import select
+import shutil
 import signal
 import subprocess
 import time
@@ -317,6 +318,30 @@ def test_reading_h5py_block_runs(daemon, fbar, tmp_path):
                             capture_output=True, text=True, timeout=20)
     assert result.returncode == 0, result.stderr
     assert len(result.stdout.splitlines()) >= 3
+
+
+@pytest.mark.long
+def test_reading_octave_block_runs(daemon, fbar, tmp_path):
+    """The lines of the page, and what they read printed: as h5py reads it."""
+    assert shutil.which("octave-cli"), "Octave is not installed: make deps-long"
+    assert fbar("run", "dam-break", *SMALL, "-o", "dam.h5", url=daemon).returncode == 0
+    text = (conftest.ROOT / "docs" / "reading.md").read_text()
+    block = re.search(r"```octave\n(.*?)```", text, re.S)[1]
+    (tmp_path / "read.m").write_text(block + 'printf("%d %d %.17g\\n", i, columns(x), frames.time(i));\n'
+                                     'printf("%.17g %.17g %.17g\\n", [x(1:2, :); p(:)\']);\n')  # fmt: skip
+    done = subprocess.run(["octave-cli", "--no-gui", "--norc", "read.m"], cwd=tmp_path, capture_output=True, text=True,
+                          timeout=120)  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "dam.png").read_bytes()[:4] == b"\x89PNG" and (tmp_path / "dam.png").stat().st_size > 10000
+    (i, count, time_), *rows = [[float(v) for v in line.split()] for line in done.stdout.splitlines()
+                                if re.fullmatch(r"(-?[\d.e+-]+ ?){3}", line)]  # fmt: skip
+    with h5py.File(tmp_path / "dam.h5") as f:
+        times = f["fbard/frames/time"][:]
+        k = int(np.argmin(abs(times - 0.2)))
+        start, n = f["fbard/frames/row"][k], f["fbard/frames/count"][k]
+        x, p = f["VTKHDF/Points"][start:start + n], f["VTKHDF/PointData/mean_stress"][start:start + n]
+    assert (i, count, time_) == (k + 1, n, times[k])
+    np.testing.assert_array_equal(np.array(rows), np.column_stack([x[:, :2], -p]))
 
 
 def test_reading_subscriber_block_runs(daemon, fbar, tmp_path):
