@@ -82,7 +82,7 @@ $(call levels,$(LANES_SRC)): ALL_CFLAGS += $(LANES_FLAGS)
 .PHONY: studies all programs deps deps-page deps-long deps-report libmpm demo report report-page report-docs check check-all check-layers check-unit \
 	check-physics check-api check-page \
 	check-cli check-loss check-hard check-asan check-clang check-fuzz check-tsan unit-programs check-long bench bench-solver bench-peer \
-	bench-recording bench-page bench-status bench-threads fuzz install uninstall format clean help
+	bench-recording bench-page bench-status bench-threads bench-tutorial fuzz install uninstall format clean help
 .DELETE_ON_ERROR:
 .SECONDARY:
 
@@ -321,6 +321,9 @@ bench-threads: all ## what a second thread is worth to runs of several sizes, on
 
 bench-page: all $(PAGE_MODULES)/.installed ## the live page with a million particles
 	$(Q)FBARD=$(CURDIR)/$(B)/fbard PAGE_MODULES=$(CURDIR)/build/page node bench/page.mjs
+
+bench-tutorial: ## the commands of docs/tutorial.md in a fresh clone: how long each takes
+	$(Q)$(PYTHON) bench/tutorial.py
 
 bench-status: all ## how fast the daemon answers while a run uses all cores, and what that costs the run
 	$(Q)FBARD=$(CURDIR)/$(B)/fbard $(PYTHON) bench/status.py
