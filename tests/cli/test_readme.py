@@ -1,4 +1,5 @@
-"""Every command that README.md shows in a sh block, run word for word as far as a test can."""
+"""Every command that README.md and docs/tutorial.md show in a sh block, run word for word as far as a test can; those that
+stand in the text of any page are there."""
 import json
 import os
 import pathlib
@@ -97,15 +98,73 @@ def test_client_lines(url, tmp_path):
                 assert start == (b"\x89PNG" if name.endswith(".png") else b"\x89HDF")
 
 
-def test_make_lines():
-    """The targets exist, those named in the text too; running them is their own business."""
-    shown = [word for words in commands() if words[0] == "make" for word in words[1:] if word[0] != "-"]
+# ---- Commands in the texts of all pages -----------------------------------------------------------------
+
+PAGES = [conftest.ROOT / "README.md", *sorted((conftest.ROOT / "docs").glob("*.md")),
+         *(conftest.ROOT / name for name in ("scenes/README.md", "proto/README.md", "tests/README.md", "bench/report/README.md"))]
+# Whose blocks are run: here, by test_install (libmpm) and by test_daemon (reading). JSON: test_json_of_the_pages_*.
+RUN = {"README.md": {"sh"}, "docs/tutorial.md": {"sh"}, "docs/libmpm.md": {"sh", "c"}, "docs/reading.md": {"python", "octave"}}
+
+
+def mentioned():
+    """[(page, [word, ...])]: what stands in a line of text as `make ...`, `build/fbar ...`, `fbard ...` or `curl ...`."""
+    found = []
+    for page in PAGES:
+        text = re.sub(r"^```.*?^```$", "", page.read_text(), flags=re.M | re.S)
+        for command in re.findall(r"`((?:make|curl|(?:build/)?fbard?) [^`]+)`", text):
+            found.append((page.name, shlex.split(command)))
+    return found
+
+
+def test_no_page_has_a_block_of_commands_that_no_test_runs():
+    for page in PAGES:
+        kinds = set(re.findall(r"^```([a-z]+)$", page.read_text(), re.M)) - {"json"}
+        assert kinds == RUN.get(str(page.relative_to(conftest.ROOT)), set()), page
+
+
+def test_targets_that_pages_name_exist():
+    """Running them is their own business."""
     assert ["make", "deps"] in commands() and "`make demo`" in README and "`make check`" in README
+    lines = [words[1:] for _, words in mentioned() if words[0] == "make"] + [
+        words[1:] for words in commands() if words[0] == "make"]  # fmt: skip
+    targets = {word for words in lines for word in words if word[0] != "-" and "=" not in word}
+    settings = {word.split("=")[0] for words in lines for word in words if "=" in word}
+    assert len(targets) > 15 and {"SIZE", "PREFIX"} <= settings
+    makefile = (conftest.ROOT / "Makefile").read_text()
+    for name in settings:
+        assert re.search(rf"^{name} \?=|\$\({name}\)", makefile, re.M), name
     # All at once, and MAKE=: so that no part is read anew for each target that calls it: all are targets of their own.
-    targets = {*shown, *re.findall(r"`make ([a-z-]+)`", README)}
     done = subprocess.run(["make", "-n", "MAKE=:", *sorted(targets)], cwd=conftest.ROOT, capture_output=True, text=True,
                           env={k: v for k, v in os.environ.items() if k not in ("MAKEFLAGS", "MFLAGS")})
     assert done.returncode == 0, done.stderr
+
+
+def test_commands_and_options_that_pages_name_exist():
+    known = {}
+
+    def said(*words):
+        if words not in known:
+            known[words] = subprocess.run(words, capture_output=True, text=True).stdout
+        return known[words]
+
+    lines = [(page, words) for page, words in mentioned() if words[0].removeprefix("build/") in ("fbar", "fbard")]
+    assert len(lines) > 20
+    for page, words in lines:
+        if words[0].endswith("fbard"):
+            text = said(conftest.FBARD, "--help")
+        else:
+            command = next((w for w in words[1:] if re.fullmatch("[a-z]+", w) and f"\n  {w} " in said(conftest.FBAR, "help")), "")
+            assert command or set(words[1:]) <= {"help", "COMMAND", "--version"}, (page, words)
+            text = said(conftest.FBAR, "help") + said(conftest.FBAR, "help", command or "run")
+        for option in (w.split("=")[0] for w in words if w[:2] == "--"):
+            assert re.search(rf"(?<![\w-]){option}(?![\w-])", text), (page, words)
+
+
+def test_curl_lines_in_texts(url):
+    lines = [words for _, words in mentioned() if words[0] == "curl" and words[-1].startswith(ADDRESS)]
+    assert lines
+    for words in lines:
+        assert curl(words, url)[2]
 
 
 def places(path):
@@ -131,11 +190,26 @@ def test_links_lead_somewhere(name):
         assert not place or target.suffix != ".md" or place in places(target), f"{name}: {link}"
 
 
+def test_json_of_the_pages_is_json_and_scenes_are_valid(url):
+    """Fragments parse; what stands there as a whole, a scene, a request or a patch of the dam break, is valid."""
+    blocks = [(page.name, text) for page in PAGES for text in re.findall(r"^```json\n(.*?)^```$", page.read_text(), re.M | re.S)]
+    assert len(blocks) > 8
+    whole = []
+    for page, text in blocks:
+        value = json.loads(text if text.lstrip()[0] == "{" else "{" + text + "}")
+        if value.get("format") == "fbard-scene-1":
+            whole.append({"scene": value})
+        elif "overrides" in value:
+            whole.append({key: value[key] for key in ("scene", "overrides")})
+        elif page == "README.md":  # of scenes/
+            whole.append({"scene": "dam-break", "overrides": value})
+    assert len(whole) >= 3
+    for body in whole:
+        assert curl(["curl", "--json", json.dumps(body), f"{url}/v1/scenes:validate"], url)[0] == 200
+
+
 def test_nothing_is_left_out():
     assert {words[0] for words in commands()} <= {"make", "curl", "build/fbar"}
-    for command in re.findall(r"`build/fbar ([a-z]+)`", README):
-        assert command == "help" or f"\n  {command} " in subprocess.run(
-            [conftest.FBAR, "--help"], capture_output=True, text=True).stdout
     for picture in re.findall(r"!\[[^]]*\]\(([^)]+)\)", README):
         assert pathlib.Path(conftest.ROOT / picture).stat().st_size <= 250_000
 
