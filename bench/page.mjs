@@ -10,6 +10,7 @@ import path from "node:path";
 import { Daemon, launch, open, until } from "../tests/page/harness.mjs";
 
 const SECONDS = Number(process.env.SECONDS ?? 4);
+const STILL_S = 10;
 const pictures = process.env.PICTURES;
 
 // Over a million particles each; two fields a frame, as the page asks for.
@@ -30,6 +31,10 @@ const watchful = () => {
   };
   new PerformanceObserver((list) => window.blocked.push(...list.getEntries().map((e) => ({ at: e.startTime, ms: e.duration })))).observe({ entryTypes: ["longtask"] });
 };
+
+// Milliseconds that the daemon's threads have run, by the scheduler's account (finer than the kernel's ticks).
+const threads = ({ process: { pid } }) =>
+  fs.readdirSync(`/proc/${pid}/task`).reduce((sum, id) => sum + Number(fs.readFileSync(`/proc/${pid}/task/${id}/schedstat`, "utf8").split(" ")[0]) / 1e6, 0);
 
 const median = (list) => [...list].sort((a, b) => a - b)[list.length >> 1];
 const round = (x, digits = 2) => Number(x.toPrecision(digits));
@@ -92,6 +97,10 @@ async function measure(browser, daemon, { id, scene, overrides }) {
     const { fps, gap, task, count, least } = await turn(page);
     console.log(`  ${what} ${round(fps)} pictures/s of ${count.toLocaleString("en")} particles (at least ${least.toLocaleString("en")}) of ${of.toLocaleString("en")}; longest pause ${round(gap)} ms, longest task ${round(task)} ms`);
   };
+  await page.waitForTimeout(3000);
+  const [rest, stood] = [threads(daemon), performance.now()];
+  await page.waitForTimeout(1000 * STILL_S);
+  console.log(`  standing still: ${round(threads(daemon) - rest)} ms of the daemon's processor time in ${round((performance.now() - stood) / 1000)} s`);
   await show("turned:              ", first);
   const still = await page.evaluate(() => performance.now());
   console.log(`  let go: all are drawn after ${round((await drawnOf(page, first, still)) - still)} ms`);

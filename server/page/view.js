@@ -55,7 +55,8 @@ const FIELD_OF_VIEW = (30 * Math.PI) / 180;
 const SMOOTH_MS = 40;
 const LEAST_PARTICLES = 5000; // fewer are no picture any more
 const SETTLE_MS = 200; // of rest, then all are drawn
-const SETTLE_SHARE = 4; // and at least so many times what all of them take: the page must answer in between
+const SETTLE_SHARE = 4; // and so many times what all of them take: the page must answer in between;
+const SETTLED_MS = 1000; // but not longer
 
 function program(gl, vertex, fragment) {
   const p = gl.createProgram();
@@ -187,7 +188,8 @@ export class View {
     this.background = [1, 1, 1, 1];
     this.ink = [0, 0, 0, 1];
     this.pending = false;
-    this.pace = 0; // ms that a particle takes to draw, as last measured
+    this.pace = 0; // ms that a particle takes to draw, as last measured, beyond
+    this.least = null; // what a picture takes that has next to none, ms
     this.settling = 0; // timer: then all are drawn
     this.setUp();
     canvas.addEventListener("webglcontextlost", (event) => event.preventDefault());
@@ -280,14 +282,16 @@ export class View {
     const all = this.pace * this.count;
     const part = all > SMOOTH_MS ? Math.max(LEAST_PARTICLES, Math.floor(SMOOTH_MS / this.pace)) : this.count;
     this.draw(Math.min(part, this.count));
-    if (part < this.count) this.settling = setTimeout(() => requestAnimationFrame(() => this.draw()), Math.max(SETTLE_MS, SETTLE_SHARE * all));
+    if (part < this.count) this.settling = setTimeout(() => requestAnimationFrame(() => this.draw()), Math.min(SETTLED_MS, Math.max(SETTLE_MS, SETTLE_SHARE * all)));
   }
 
   // The next picture of the browser comes when this one is done.
   measure(began, count) {
     requestAnimationFrame(() => {
       if (document.hidden || count < LEAST_PARTICLES) return;
-      this.pace = Math.max(0, performance.now() - began - 1000 / 60) / count;
+      const took = performance.now() - began;
+      if (count <= 2 * LEAST_PARTICLES) this.least = Math.min(took, this.least ?? took);
+      this.pace = Math.max(0, took - (this.least ?? 1000 / 60)) / count;
     });
   }
 
