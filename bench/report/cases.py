@@ -2,6 +2,11 @@
 report lists its own (`cases(size)` in cook.py and its neighbours)."""
 import dataclasses
 import itertools
+import pathlib
+import sys
+
+sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1]))
+from study import merged  # noqa: E402
 
 SIZES = ("small", "paper", "tiny")  # tiny: for the test of the report itself, seconds and no physics
 
@@ -17,19 +22,6 @@ class Case:
     overrides: dict = dataclasses.field(default_factory=dict)  # merge patch (RFC 7396)
     rank: float = 0  # lower ranks run first
     labels: dict = dataclasses.field(default_factory=dict)  # what a part knows it by: basis, scheme, cell, ...
-
-
-def merged(target, patch):
-    """`target` with the merge patch (RFC 7396) applied; neither is changed."""
-    if not isinstance(patch, dict):
-        return patch
-    result = dict(target) if isinstance(target, dict) else {}
-    for key, value in patch.items():
-        if value is None:
-            result.pop(key, None)
-        else:
-            result[key] = merged(result.get(key), value)
-    return result
 
 
 def grid(prefix, scene, overrides, ranks, bases=("gimp", "bspline2"), schemes=tuple(SCHEMES), **labels):
