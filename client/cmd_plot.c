@@ -25,7 +25,7 @@
 static const struct option_spec options[] = {
     {"output", 'o', "FILE.png", "the picture"},
     {"field", 'f', "NAME", "what colours the particles (default mean_stress)"},
-    {"component", 'c', "COMPONENT",
+    {"component", 'c', "NAME",
      "x, y, z or xx, xy, ... or magnitude (default) of a vector or tensor"},
     {"time", 't', "TIME", "the nearest frame, s (default: the last); T1,T2,... are a row each"},
     {"difference", 'd', NULL, "the second recording less the first, or the second of two times"},

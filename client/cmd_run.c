@@ -139,6 +139,8 @@ static int follow(struct client *client, const struct arguments *arguments, cons
         if (file && !client->json)
             printf("%s: %zu frames, %.1f MB%s\n", file, result.n_frames,
                    1e-6 * (double)result.bytes, result.complete ? "" : ", not complete");
+        if (code == CLIENT_DONE && private && !file && !client->json)
+            terminal_note("nothing of it is kept; -o FILE.h5 records every frame");
         if (code == CLIENT_DONE)
             code = outcome;
         else if (!private)

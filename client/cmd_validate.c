@@ -2,6 +2,7 @@
 #include <cjson/cJSON.h>
 #include <stdio.h>
 #include <stdlib.h>
+#include <string.h>
 
 #include "client/arguments.h"
 #include "client/client.h"
@@ -9,6 +10,7 @@
 #include "client/overrides.h"
 #include "client/report.h"
 #include "client/request.h"
+#include "client/terminal.h"
 
 static const struct option_spec options[] = {
     {"set", 's', "KEY=VALUE", "override a value of the scene"},
@@ -35,13 +37,39 @@ static int scene_text(struct client *client, const char *word, char **out) {
     return code;
 }
 
+// What else there is in the estimate of a later daemon is shown as it is.
+static const struct {
+    const char *key, *label;
+    double factor;
+    const char *unit;
+} lines[] = {
+    {"dt", "dt", 1, " s"},
+    {"dt_limit", "dt at most", 1, " s"},
+    {"bytes", "memory", 1e-6, " MB"},
+};
+
 static void print_estimate(const cJSON *answer) {
     const cJSON *estimate = cJSON_GetObjectItemCaseSensitive(answer, "estimate"), *item;
     if (!cJSON_IsObject(estimate))
         estimate = answer;
     puts("valid");
-    cJSON_ArrayForEach(item, estimate) if (cJSON_IsNumber(item))
-        printf("%-12s %.6g\n", item->string, item->valuedouble);
+    cJSON_ArrayForEach(item, estimate) {
+        const char *label = item->string, *unit = "";
+        double factor = 1;
+        for (size_t k = 0; k < sizeof lines / sizeof *lines; k++) {
+            if (strcmp(item->string, lines[k].key) == 0) {
+                label = lines[k].label;
+                factor = lines[k].factor;
+                unit = lines[k].unit;
+            }
+        }
+        if (cJSON_IsNumber(item))
+            printf("%-12s %.6g%s\n", label, factor * item->valuedouble, unit);
+    }
+    cJSON_ArrayForEach(item, cJSON_GetObjectItemCaseSensitive(answer, "warnings")) {
+        if (cJSON_IsString(item))
+            terminal_note("warning: %s", item->valuestring);
+    }
 }
 
 static int validate(struct client *client, const struct arguments *arguments) {

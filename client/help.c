@@ -53,7 +53,8 @@ static void print_lines(const char *lines) {
 }
 
 void help_print_command(const struct command *command) {
-    printf("usage: fbar %s %s\n\n%s\n", command->name, command->positionals, command->summary);
+    printf("usage: fbar %s%s%s\n\n%s\n", command->name, *command->positionals ? " " : "",
+           command->positionals, command->summary);
     if (command->doc)
         printf("\n%s\n", command->doc);
     if (command->options) {

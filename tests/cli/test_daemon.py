@@ -299,6 +299,19 @@ def test_run_alone_killed_takes_its_daemon_along_and_recovers(start_fbar, fbar, 
         assert len(f["fbard/frames/seq"]) >= 2 and f["fbard"].attrs["complete"] == 0
 
 
+def test_run_alone_without_a_file_says_that_nothing_is_kept(fbar, temporary):
+    result = fbar("run", "dam-break", *SMALL, "--set", "time.end=0.01")
+    assert result.returncode == 0 and "nothing of it is kept; -o FILE.h5" in result.stderr
+    assert list(temporary.iterdir()) == []
+
+
+def test_validate_tells_cost_with_units_and_warnings(daemon, fbar):
+    result = fbar("validate", "dam-break", "--set", "basis=linear", url=daemon)
+    assert result.returncode == 0 and "linear" in result.stderr and "warning: " in result.stderr
+    cost = dict(re.split(r" {2,}", line) for line in result.stdout.splitlines()[1:])
+    assert cost["particles"] == "3200" and cost["dt"].endswith(" s") and cost["memory"].endswith(" MB")
+
+
 def test_run_alone_with_an_invalid_scene_leaves_nothing(fbar, temporary, tmp_path):
     result = fbar("run", "dam-break", "--set", "cell=-1", "-o", "a.h5")
     assert result.returncode == 2 and "/cell: " in result.stderr
