@@ -7,14 +7,16 @@ import http.client
 import json
 import os
 import re
+import sys
 import time
+import traceback
 
 import jsonschema
 import pytest
 
 hypothesis = pytest.importorskip("hypothesis")
 from boxes import ENDLESS, endless, water  # noqa: E402
-from fbard import FINAL, PATIENCE, Daemon, Reply, check_form, until  # noqa: E402
+from fbard import FINAL, Daemon, Reply, check_form, until  # noqa: E402
 from hypothesis import strategies as st  # noqa: E402
 from hypothesis.stateful import Bundle, RuleBasedStateMachine, consumes, invariant, multiple, rule  # noqa: E402
 from test_openapi_document import operations, resolve  # noqa: E402
@@ -22,6 +24,7 @@ from test_openapi_document import operations, resolve  # noqa: E402
 LONG = bool(os.environ.get("FBARD_LONG"))
 EXAMPLES, STEPS = (2600, 50) if LONG else (40, 35)
 WANTED = 100_000 if LONG else 1_000
+HANGS = 600.0  # s without an answer: more than a machine may stand still on which this is not alone
 SLOTS, QUEUE = 2, 4
 ALIVE = {"queued", "running", "waiting", "paused"}
 GOING = {"queued", "running", "waiting"}
@@ -51,14 +54,24 @@ class Kept(Daemon):
         if body is not None and not isinstance(body, bytes):
             body = json.dumps(body).encode()
             headers.setdefault("Content-Type", "application/json")
-        if self.connection is None or time.monotonic() - self.used > 20:  # idle connections are closed after 30 s
-            self.connection = http.client.HTTPConnection(self.host, timeout=PATIENCE)
-        self.connection.request(method, path, body, headers)
-        answer = self.connection.getresponse()
+        try:
+            answer = self.send(method, path, body, headers)
+        except (http.client.RemoteDisconnected, ConnectionResetError, BrokenPipeError):
+            if time.monotonic() - self.used < 20:  # idle connections are closed after 30 s
+                raise
+            self.connection = None
+            answer = self.send(method, path, body, headers)
         reply = check_form(Reply(method, path, answer.status, answer.getheaders(), answer.read()))
         self.used = time.monotonic()
         self.judge(reply)
         return reply
+
+
+    def send(self, method, path, body, headers):
+        if self.connection is None:
+            self.connection = http.client.HTTPConnection(self.host, timeout=HANGS)
+        self.connection.request(method, path, body, headers)
+        return self.connection.getresponse()
 
 
 class Service:
@@ -158,9 +171,12 @@ class Model(RuleBasedStateMachine):
         self.known = []
 
     def teardown(self):
+        error = sys.exc_info()[1]
+        if isinstance(error, Exception) and not isinstance(error, hypothesis.errors.HypothesisException):
+            traceback.print_exception(error)  # what does not come again when hypothesis repeats it would be lost
         for run in self.known:
             service.daemon.request("POST", f"/v1/runs/{run.name}:cancel")
-            until(lambda: service.daemon.run(run.name)["state"] in FINAL)
+            until(lambda: service.daemon.run(run.name)["state"] in FINAL, HANGS)
             service.daemon.ask("DELETE", f"/v1/runs/{run.name}", status=204)
         assert service.bystanders() == service.untouched
         assert {r["id"] for r in service.daemon.get("/v1/runs")["runs"]} == {"bystander-over", "bystander-paused"}
@@ -222,7 +238,7 @@ class Model(RuleBasedStateMachine):
         reply = service.ask("POST", f"/v1/runs/{run.name}:step", {"steps": steps})
         self.judge(run, "step", reply)
         if reply.status == 200 and not run.ends:
-            now = until(lambda: (r := service.daemon.run(run.name))["state"] == "paused" and r or self.crowded())
+            now = until(lambda: (r := service.daemon.run(run.name))["state"] == "paused" and r or self.crowded(), HANGS)
             run.stepping = now is True
             if now is not True:
                 run.states = {"paused"}
@@ -262,7 +278,7 @@ class Model(RuleBasedStateMachine):
         if reply.status == 409:
             assert run.moves() & ALIVE, reply
             service.daemon.request("POST", f"/v1/runs/{run.name}:cancel")
-            until(lambda: service.daemon.run(run.name)["state"] in FINAL)
+            until(lambda: service.daemon.run(run.name)["state"] in FINAL, HANGS)
             reply = service.ask("DELETE", f"/v1/runs/{run.name}")
         else:
             assert run.moves() & set(FINAL), reply
