@@ -46,7 +46,7 @@ class Kept(Daemon):
     """Asks over one connection that is kept: what an answer leaves behind would spoil the next one. Answers are held
     against the document as they come, and not kept for test_openapi_document: there are too many."""
 
-    connection, used = None, 0.0
+    connection, asked = None, 0.0
     judge = staticmethod(lambda reply: None)
 
     def request(self, method, path, body=None, headers=None, check=True):
@@ -54,18 +54,18 @@ class Kept(Daemon):
         if body is not None and not isinstance(body, bytes):
             body = json.dumps(body).encode()
             headers.setdefault("Content-Type", "application/json")
+        now = time.monotonic()
         try:
             answer = self.send(method, path, body, headers)
         except (http.client.RemoteDisconnected, ConnectionResetError, BrokenPipeError):
-            if time.monotonic() - self.used < 20:  # idle connections are closed after 30 s
-                raise
             self.connection = None
+            if time.monotonic() - self.asked < 20:  # idle connections are closed after 30 s, also where both sides stood still
+                raise
             answer = self.send(method, path, body, headers)
+        self.asked = now
         reply = check_form(Reply(method, path, answer.status, answer.getheaders(), answer.read()))
-        self.used = time.monotonic()
         self.judge(reply)
         return reply
-
 
     def send(self, method, path, body, headers):
         if self.connection is None:
