@@ -5,6 +5,7 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <sys/prctl.h>
 #include <sys/resource.h>
 #include <unistd.h>
 
@@ -123,6 +124,11 @@ static void start_with_short_spins(char **argv) {
         execv("/proc/self/exe", argv);            // on failure, go on as we are
 }
 
+// Who started itself by way of /proc/self/exe is called "exe" in ps and top otherwise.
+static void take_name(void) {
+    prctl(PR_SET_NAME, "fbard");
+}
+
 // A run that steps holds two files, a connection one or two; the usual soft limit of 1024 is there
 // for the sake of select(), which nothing here uses.
 static void raise_open_files(void) {
@@ -135,6 +141,7 @@ static void raise_open_files(void) {
 
 int main(int argc, char **argv) {
     start_with_short_spins(argv);
+    take_name();
     static struct options options;
     char message[8192], why[JOURNAL_WHY];
     switch (options_parse(argc, argv, &options, message, sizeof message)) {

@@ -80,6 +80,12 @@ def test_version_resource_describes_the_daemon(daemon):
     assert "threads" in text and "limits" in about
 
 
+def test_process_is_called_by_its_name(daemon):
+    """Not "exe", by which it starts itself once more: ps, top and pidof must find it."""
+    with open(f"/proc/{daemon.process.pid}/comm") as f:
+        assert f.read() == "fbard\n"
+
+
 def test_small_runs_have_fewer_threads_unless_told_otherwise(fresh):
     """`--help`: cores / slots; fewer for a small run (one for each 8,192 particles)."""
     for threads, small, large in ((None, 1, min(len(os.sched_getaffinity(0)), 51200 // 8192)), (3, 3, 3)):

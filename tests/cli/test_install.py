@@ -174,3 +174,25 @@ def test_systemd_accepts_the_unit(tmp_path):
     assert done.returncode == 0 and not done.stderr.strip(), done.stderr
     done = run("systemd-analyze", "security", "--offline=yes", "--threshold=20", unit)  # 2.0 of 10
     assert done.returncode == 0, done.stdout[-300:]
+
+
+@pytest.mark.long
+@pytest.mark.skipif(os.getuid() != 0, reason="a systemd of its own needs root")
+def test_a_real_systemd_starts_stops_and_restarts_it(root, tmp_path):
+    """The unit as installed, all of its hardening on: ready, stopped and started again, killed and restarted, and each
+    time the run goes on from where it was."""
+    unit = root / "usr/lib/systemd/system/fbard.service"
+    done = subprocess.run([ROOT / "tests/cli/systemd.sh", tmp_path, root / "usr", unit], capture_output=True, text=True)
+    assert (tmp_path / "log").exists(), done.stderr + (tmp_path / "console").read_text()[-2000:]
+    log = (tmp_path / "log").read_text()
+    told = dict(line.split(": ", 1) for line in log.splitlines())
+    why = log + (tmp_path / "session.err").read_text()
+    assert told["start"] == "0" and told["start.again"] == "0", why  # Type=notify: it has said that it is ready
+    assert int(told["user"]) > 0, "not as root"
+    assert told["stop"] == "0" and told["stop.result"] == "success 0", why
+    assert told["restarts"] == "1", why
+    runs = [json.loads((tmp_path / f"{name}.json").read_text()) for name in ("first", "second", "third")]
+    assert [told[name] for name in ("first", "second", "third")] == ["active"] * 3, why
+    assert [r["state"] for r in runs] == ["running"] * 3
+    assert 0 < runs[0]["step"] < runs[1]["step"], "it goes on from its checkpoint"
+    assert runs[2]["step"] > runs[0]["step"] and len({r["epoch"] for r in runs}) == 1, "after kill -9, too"
