@@ -2,15 +2,16 @@
 """How fast the daemon answers while a run uses all cores, and what answering costs the run.
 
 100 status requests a second, at fixed times, over 32 connections that are kept; latency counts from the time at which
-a request was due, so that a late client is not flattering. The run never stops; requests come in every other half second,
+a request was due, so that a late client is not flattering, to the answer's arrival at the client's socket (the kernel's
+time stamp). The client wakes once for a request, to send it, and then also takes earlier answers: it is on the same cores. The run never stops; requests come in every other half second,
 and the run's speed then is compared with that in the half seconds beside it: what else goes on on a machine changes more
 slowly than that, and moves both."""
 import json
 import os
 import pathlib
-import selectors
 import socket
 import statistics
+import struct
 import sys
 import tempfile
 import time
@@ -21,6 +22,7 @@ import fbard  # noqa: E402
 from boxes import big  # noqa: E402
 
 RATE, CONNECTIONS = 100, 32
+SO_TIMESTAMPNS = 35  # socket(7); of <asm-generic/socket.h>
 SLICE = 0.5  # s; the status is at most 20 ms old, steps and seconds in it are of one moment
 PAIRS = int(os.environ.get("PAIRS", 60))
 
@@ -29,44 +31,57 @@ class Connection:
     def __init__(self, host, request):
         self.socket = socket.create_connection(host)
         self.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self.request, self.due, self.left, self.head = request, [], None, b""
+        self.socket.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
+        self.socket.setblocking(False)
+        self.request, self.due, self.text = request, None, b""
 
     def send(self, due):
-        self.due.append(due)
+        assert self.due is None, "an answer takes longer than all connections together"
+        self.due = due
         self.socket.sendall(self.request)
 
-    def receive(self):
-        """Latencies of the answers that are whole now."""
-        self.head += self.socket.recv(65536)
-        now, done = time.monotonic(), []
-        while True:
-            end = self.head.find(b"\r\n\r\n")
-            if end < 0:
-                return done
-            assert self.head.startswith(b"HTTP/1.1 200"), self.head[:200]
-            length = int(self.head.split(b"Content-Length: ")[1].split(b"\r\n")[0])
-            if len(self.head) < end + 4 + length:
-                return done
-            self.head = self.head[end + 4 + length :]
-            done.append(now - self.due.pop(0))
+    def receive(self, clock):
+        """Seconds from when the request was due to the answer's arrival, or None. `clock`: monotonic less real time."""
+        try:
+            text, ancillary, _, _ = self.socket.recvmsg(65536, 64)
+        except BlockingIOError:
+            return None
+        assert text, "closed"
+        self.text += text
+        head, _, body = self.text.partition(b"\r\n\r\n")
+        assert head.startswith(b"HTTP/1.1 200"), head[:200]
+        if len(body) < int(head.split(b"Content-Length: ")[1].split(b"\r\n")[0]):
+            return None
+        ((_, kind, stamp),) = ancillary
+        assert kind == SO_TIMESTAMPNS
+        seconds, nanoseconds = struct.unpack("qq", stamp)
+        latency = seconds + 1e-9 * nanoseconds + clock - self.due
+        self.due, self.text = None, b""
+        return latency
 
 
 def ask_for(connections, seconds, first):
     """Latencies of RATE requests a second, sent in turn over the connections from number `first` on."""
-    selector, latencies = selectors.DefaultSelector(), []
-    for c in connections:
-        selector.register(c.socket, selectors.EVENT_READ, c)
+    clock, latencies, asked = time.monotonic() - time.time(), [], []
     began = time.monotonic()
-    sent, total = 0, int(RATE * seconds)
-    while len(latencies) < total:
-        now = time.monotonic()
-        while sent < total and began + sent / RATE <= now:
-            connections[(first + sent) % CONNECTIONS].send(began + sent / RATE)
-            sent += 1
-        wait = max(0.0, began + sent / RATE - time.monotonic()) if sent < total else 1.0
-        for key, _ in selector.select(wait):
-            latencies += key.data.receive()
-    selector.close()
+
+    def gather():
+        for c in list(asked):
+            latency = c.receive(clock)
+            if latency is not None:
+                latencies.append(latency)
+                asked.remove(c)
+
+    for k in range(int(RATE * seconds)):
+        due = began + k / RATE
+        time.sleep(max(0.0, due - time.monotonic()))
+        connection = connections[(first + k) % CONNECTIONS]
+        connection.send(due)
+        gather()
+        asked.append(connection)
+    while asked:
+        time.sleep(0.5 / RATE)
+        gather()
     return latencies
 
 
