@@ -1,7 +1,9 @@
 """The command line, signals, and what survives them."""
+import concurrent.futures
 import http.client
 import json
 import os
+import random
 import re
 import resource
 import shutil
@@ -10,6 +12,7 @@ import socket
 import ssl
 import stat
 import subprocess
+import threading
 import time
 
 import pytest
@@ -397,6 +400,71 @@ def test_killed_right_after_201_the_run_is_there(fresh):
     d.act(runs[1], "resume")
     d.wait(runs[1], "completed")
     assert d.csv(runs[0]) == d.csv(runs[1])
+
+
+class Crowd:
+    """Clients that create and delete until the daemon is gone, and what they were answered."""
+
+    def __init__(self, daemon):
+        self.daemon, self.lock = daemon, threading.Lock()
+        self.there, self.gone, self.unanswered, self.count = set(), set(), set(), 0
+
+    def create(self, random_):
+        with self.lock:
+            self.count += 1
+            name = f"k{self.count}"
+            self.unanswered.add(name)
+        key = {"Idempotency-Key": name} if random_.random() < 0.5 else {}
+        body = {"scene": water(time={"end": 0.002}), "id": name, "start": random_.random() < 0.5}
+        assert self.daemon.request("POST", "/v1/runs", body, key).status == 201
+        with self.lock:
+            self.unanswered.discard(name)
+            self.there.add(name)
+
+    def delete(self, random_):
+        with self.lock:
+            if not self.there:
+                return
+            name = random_.choice(sorted(self.there))
+            self.there.discard(name)
+            self.unanswered.add(name)
+        self.daemon.request("POST", f"/v1/runs/{name}:cancel")
+        reply = self.daemon.request("DELETE", f"/v1/runs/{name}")
+        assert reply.status in (204, 409), reply  # 409: it is ending
+        with self.lock:
+            self.unanswered.discard(name)
+            (self.gone if reply.status == 204 else self.there).add(name)
+
+    def work(self, seed):
+        random_ = random.Random(seed)
+        try:
+            while True:
+                (self.create if random_.random() < 0.6 else self.delete)(random_)
+        except (OSError, http.client.HTTPException):
+            pass  # killed
+
+
+def test_kills_amid_creation_and_deletion_leave_what_was_answered(fresh):
+    """What was answered with 201 is there, what was answered with 204 is not, and nothing is half there."""
+    d = fresh("--queue", "5000").start()
+    crowd, random_ = Crowd(d), random.Random(int(os.environ.get("FBARD_SEED", 3)))
+    for _ in range(40 if os.environ.get("FBARD_LONG") else 4):
+        with concurrent.futures.ThreadPoolExecutor(6) as pool:
+            clients = [pool.submit(crowd.work, random_.random()) for _ in range(6)]
+            time.sleep(random_.uniform(0.05, 0.5))
+            d.kill()
+            for client in clients:
+                client.result()
+        d.start()
+        until(lambda: d.request("GET", "/v1/runs").status == 200)  # has read all of them
+        runs = {run["id"]: run for run in d.get("/v1/runs")["runs"]}
+        assert crowd.there <= set(runs) and not crowd.gone & set(runs)
+        assert not [run for run in runs.values() if run["state"] == "failed"]
+        assert set(os.listdir(d.data / "runs")) == set(runs), "nothing is left of the others"
+        for name in crowd.unanswered:
+            (crowd.there if name in runs else crowd.gone).add(name)
+        crowd.unanswered.clear()
+    assert crowd.count > 10 and crowd.gone
 
 
 def test_resume_paused_and_off_leave_runs_paused(fresh):
