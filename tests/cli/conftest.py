@@ -31,7 +31,7 @@ def pytest_collection_modifyitems(config, items):
 @pytest.fixture
 def fbar(tmp_path):
     """Runs fbar to its end: fbar("list", url=...) gives the CompletedProcess."""
-    def call(*words, url=None, timeout=30, **options):
+    def call(*words, url=None, timeout=60, **options):
         return subprocess.run(command(*words, url=url), capture_output=True, text=True,
                               timeout=timeout, cwd=tmp_path, env=environment(), **options)
     return call

@@ -195,7 +195,7 @@ def test_watch_exits_with_the_outcome(fbar, fake, start_fbar):
     daemon = fake(n_frames=4)
     watcher = start_fbar("watch", "r1", url=daemon.url)
     daemon.play(0.1)
-    out, err = watcher.communicate(timeout=10)
+    out, err = watcher.communicate(timeout=60)
     assert watcher.returncode == 0 and "r1 completed" in out
     assert "\r" not in err and "\033" not in err  # no terminal
     daemon.state = "failed"
@@ -246,12 +246,12 @@ def test_run_interrupted_pauses_the_run_of_a_shared_daemon(fake, start_fbar, tmp
     daemon = fake()
     for words in (["-o", "a.h5"], []):
         runner = start_fbar("run", "fake", *words, url=daemon.url)
-        end = time.monotonic() + 10
+        end = time.monotonic() + 60
         while not any(p == "/v1/runs/r1" for _, p in daemon.requests) and time.monotonic() < end:
             time.sleep(0.01)
         time.sleep(0.3)
         runner.send_signal(signal.SIGINT)
-        _, err = runner.communicate(timeout=10)
+        _, err = runner.communicate(timeout=60)
         assert runner.returncode == 130, err
         assert ("POST", "/v1/runs/r1:pause") in daemon.requests
         assert f"`fbar --url {daemon.url} resume r1`" in err and "Ctrl-C again leaves at once" in err

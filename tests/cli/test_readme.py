@@ -40,7 +40,7 @@ def url(tmp_path):
             [conftest.FBARD, "--http", "127.0.0.1:0", "--publish", "tcp://127.0.0.1:0", "--port-file",
              str(ports), "--data-dir", str(tmp_path / "data"), "--slots", "2"], stderr=log)
     try:
-        end = time.monotonic() + 10
+        end = time.monotonic() + 60
         while not ports.exists():
             assert process.poll() is None and time.monotonic() < end, (tmp_path / "fbard.log").read_text()
             time.sleep(0.01)

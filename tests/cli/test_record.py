@@ -319,7 +319,7 @@ def test_record_interrupted_closes_the_file_and_resumes(fbar, fake, start_fbar, 
     daemon.advance(5)
     wait_until(lambda: 4 in daemon.acks)
     recorder.send_signal(signal.SIGINT)
-    _, err = recorder.communicate(timeout=10)
+    _, err = recorder.communicate(timeout=60)
     assert recorder.returncode == 130, err
     check_frames(tmp_path / "a.h5", daemon.frames[:5], complete=False)
     daemon.advance(15, live=False)
@@ -397,7 +397,7 @@ def test_record_into_a_folder_that_vanishes_is_an_io_error(fake, start_fbar, tmp
     wait_until(lambda: 2 in daemon.acks)
     shutil.rmtree(tmp_path / "out")
     daemon.advance(3)
-    _, err = recorder.communicate(timeout=10)
+    _, err = recorder.communicate(timeout=60)
     assert recorder.returncode == 4 and "out/a.h5" in err
     assert max(daemon.acks) == 2
 
