@@ -24,7 +24,7 @@ def test_patches_of_a_running_run_are_logged_at_their_effective_step(daemon, nam
 def test_patched_in_motion_and_killed_it_continues_with_the_same_bits(fresh):
     """Epoch 0: every frame that is simulated again has the digest that the journal holds."""
     d = fresh().start()
-    scene = water(time={"dt": 2e-4, "end": 2.0}, output={"interval": 0.02, "probe_interval": 0.01})
+    scene = water(time={"dt": 2e-4, "end": 8.0}, output={"interval": 0.06, "probe_interval": 0.04})
     d.create(scene, id="patched")
     for k in range(6):
         d.wait_step("patched", 300 * (k + 1))

@@ -310,7 +310,7 @@ def test_restart_lists_earlier_runs_with_frames_and_probes(fresh):
 
 
 # 12,000 steps and 121 frames, long enough to be killed in the middle; sanitizers are that much slower
-LONG = water(time={"end": 4.5 if is_sanitized() else 12}, output={"interval": 0.1, "probe_interval": 0.01})
+LONG = water(time={"end": 4.5 if is_sanitized() else 20}, output={"interval": 0.2, "probe_interval": 0.02})
 
 
 def undisturbed(d, run):
