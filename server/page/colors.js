@@ -28,14 +28,15 @@ function polar(L, chroma, degrees) {
 const mix = (a, b, t) => a + (b - a) * t;
 
 const MAPS = {
-  // Violet, blue, green, yellow: lightness 0.30 to 0.93, hue from 300 down to 105 degrees.
-  sequential: (t) => polar(mix(0.3, 0.93, t), 0.1 + 0.06 * Math.sin(Math.PI * t) + 0.02 * t, mix(300, 105, t ** 0.9)),
+  // Violet, blue, green, yellow: lightness 0.30 to 0.93, hue from 300 down to 105 degrees. As strong as a screen has them:
+  // at t = 0.4, between blue and green, chroma 0.098 is the most, and what is cut off shows as edges that are not there.
+  sequential: (t) => polar(mix(0.3, 0.93, t), 0.097 + 0.16 * (t - 0.4) ** 2, mix(300, 105, t ** 0.9)),
   // Blue, neutral, red; the middle is pale, or dark where the page is.
   diverging: (t, dark) => {
     const u = 2 * t - 1;
     const size = Math.abs(u);
     const L = dark ? mix(0.42, 0.8, size) : mix(0.9, 0.42, size);
-    return polar(L, 0.005 + 0.155 * size ** 0.85, u < 0 ? mix(235, 262, dark ? 1 - size : size) : mix(55, 27, dark ? 1 - size : size));
+    return polar(L, 0.005 + (dark ? 0.115 : 0.155) * size ** 0.85, u < 0 ? mix(235, 262, dark ? 1 - size : size) : mix(55, 27, dark ? 1 - size : size));
   },
   grey: (t) => srgb(mix(0.25, 0.92, t), 0, 0),
 };

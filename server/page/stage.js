@@ -300,7 +300,7 @@ function upload(pane) {
   }
   // The diagonal: discs leave no gaps; and some more where a part of the particles is there, which are no lattice.
   const part = frame.count < (pane.run?.particles ?? 0);
-  const size = (part ? 1.25 : 1) * Math.SQRT2 * setting.size * spacing(pane);
+  const size = (part ? 1.5 : 1) * Math.SQRT2 * setting.size * spacing(pane);
   view.particles(p, frame.dimension, size);
   if (first || !camera.touched) fitIfOutside(first);
 }

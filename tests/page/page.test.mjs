@@ -4,6 +4,7 @@ import assert from "node:assert/strict";
 import fs from "node:fs";
 import { after, before, test } from "node:test";
 
+import { table } from "../../server/page/colors.js";
 import { Daemon, launch, look, open, until } from "./harness.mjs";
 
 let daemon;
@@ -399,6 +400,26 @@ check("a run is cancelled and deleted", async () => {
   await page.locator("#ask").getByRole("button", { name: "Delete", exact: true }).click();
   await until("it is gone", async () => !(await daemon.get("/v1/runs")).runs.some((r) => r.id === RUN));
   await until("from the list as well", async () => !(await page.locator(".run-name").allTextContents()).includes(RUN));
+});
+
+test("colour maps are even steps of lightness, without edges", () => {
+  // Lightness of OKLab (B. Ottosson, 2020) of sRGB bytes.
+  const linear = (v) => (v / 255 <= 0.04045 ? v / 255 / 12.92 : ((v / 255 + 0.055) / 1.055) ** 2.4);
+  const lightness = ([r, g, b]) =>
+    0.2104542553 * Math.cbrt(0.4122214708 * r + 0.5363325363 * g + 0.0514459929 * b) +
+    0.793617785 * Math.cbrt(0.2119034982 * r + 0.6806995451 * g + 0.1073969566 * b) -
+    0.0040720468 * Math.cbrt(0.0883024619 * r + 0.2817188376 * g + 0.6299787005 * b);
+  for (const [name, dark] of [["sequential", false], ["grey", false], ["diverging", false], ["diverging", true]]) {
+    const bytes = table(name, dark);
+    const L = Array.from({ length: 256 }, (_, k) => lightness([0, 1, 2].map((c) => linear(bytes[4 * k + c]))));
+    const [from, to] = name === "diverging" ? [[0, 127], [128, 255]] : [[0, 255], [0, 255]];
+    for (const [a, b] of [from, to])
+      for (let k = a; k <= b; k++) {
+        const even = L[a] + ((L[b] - L[a]) * (k - a)) / (b - a);
+        // Bytes are within half a step of 1/255; at these colours that is 0.004 of lightness.
+        assert.ok(Math.abs(L[k] - even) < 0.006, `${name} ${dark} at ${k}: ${L[k]}, not ${even}`);
+      }
+  }
 });
 
 test("three dimensions are orbited", async () => {
