@@ -261,9 +261,9 @@ check-loss: all $(B)/tests/failing.so ## kills, failing disks, recorders that st
 	$(Q)FBARD=$(CURDIR)/$(B)/fbard FBAR=$(CURDIR)/$(B)/fbar FAILING=$(CURDIR)/$(B)/tests/failing.so $(PYTEST) -s tests/loss
 
 # The same tests under AddressSanitizer and UBSan. `make check` leaves out what takes long there: the programs that
-# step many variants through the same code, and the API but for requests that are wrong; `make check-long` has it all.
+# step many variants through the same code, and the API but for requests that are wrong and the model; `make check-long` has it all.
 ASAN_SLOW = $(if $(FBARD_LONG),,contact state boundary fbar)
-ASAN_API = $(if $(FBARD_LONG),tests/api,$(wildcard tests/api/test_requests_*.py tests/api/test_runs_config.py))
+ASAN_API = $(if $(FBARD_LONG),tests/api,$(wildcard tests/api/test_requests_*.py tests/api/test_runs_config.py) tests/api/test_model.py)
 check-asan: ## unit and API tests with sanitizers
 	$(Q)$(MAKE) --no-print-directory -j$$(nproc) VARIANT=asan LEFT_OUT="$(ASAN_SLOW)" \
 	  build/asan/fbard build/asan/fbar unit-programs

@@ -218,6 +218,16 @@ static void answer(struct run *r, struct run_command *c, enum run_outcome outcom
 
 static void finish_soon(struct run *r);
 
+// To run is more than to do some steps, also where these still wait for a slot. The log is told,
+// for a daemon that comes after a kill.
+static void forget_stop(struct run *r) {
+    if (r->stop_step == UINT64_MAX && !isfinite(r->stop_time))
+        return;
+    r->stop_step = UINT64_MAX;
+    r->stop_time = INFINITY;
+    run_state_enter(r, r->now.state);
+}
+
 static void obey(struct run *r) {
     struct run_command *c;
     atomic_store(&r->knock, false);
@@ -231,9 +241,8 @@ static void obey(struct run *r) {
             outcome = RUN_BUSY;
         } else if (verdict == RUN_ACTS) {
             outcome = act(r, c);
-        } else if (verdict == RUN_ALREADY && r->now.state == RUN_RUNNING) {
-            r->stop_step = UINT64_MAX; // to run is more than to do some steps
-            r->stop_time = INFINITY;
+        } else if (verdict == RUN_ALREADY && !ends && !run_state_is_final(r->now.state)) {
+            forget_stop(r);
         }
         if (outcome == RUN_DONE && c->action == RUN_DO_CANCEL)
             finish_soon(r);

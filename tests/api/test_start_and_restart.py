@@ -508,6 +508,23 @@ def test_interrupted_step_still_ends_where_it_was_to(fresh):
     d.away(run)
 
 
+@pytest.mark.parametrize("queued", [True, False], ids=["queued", "running"])
+def test_resumed_step_has_no_end_any_more(fresh, queued):
+    """Also while it waits for a slot, and over a kill."""
+    d = fresh(slots=1).start()
+    other = d.create(endless(), start=queued)["id"]
+    run = d.create(endless(), start=False)["id"]
+    step = d.act(run, "step", {"steps": 30 if queued else 3000})
+    assert step["state"] in (("queued",) if queued else ("running", "queued"))
+    d.act(run, "resume")
+    d.kill()
+    d.start()
+    d.act(other, "pause")
+    d.wait_step(run, 31 if queued else 3001)
+    assert d.run(run)["state"] == "running"
+    d.away(run, other)
+
+
 def test_a_damaged_run_does_not_keep_the_daemon_from_starting(fresh):
     d = fresh().start()
     good, bad, worse = (d.create(water(), id=i)["id"] for i in ("good", "bad", "worse"))
