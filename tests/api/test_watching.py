@@ -184,6 +184,7 @@ def test_stream_gives_the_published_bytes_to_the_end(daemon, name):
         frames = stream.frames()
         blocks = [next(frames)]
         while not Frame(blocks[-1]).header["end"]:
+            daemon.wait(name, "paused")  # a frame is on its way before its run has paused
             daemon.act(name, "step", {"steps": 10})
             blocks.append(next(frames))
         assert list(frames) == []
