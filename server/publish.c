@@ -20,6 +20,7 @@
 
 #define SEND_HIGH_WATER 8 // messages a subscriber may lag before it loses some
 #define LINGER_MS 1000
+#define SPARE_SLACK 4096   // bytes
 #define RETRY_SECONDS 0.5  // between two tries on a full disk
 #define LOG_SECONDS 60     // between two lines about the same trouble
 #define EVENTS_MAX 256     // queued events of a run; the log has them all
@@ -43,6 +44,9 @@ struct outlet {
     // Under the publisher's lock:
     struct item *first, *last;
     unsigned n_frames, n_events;
+    struct outlet_frame *spare[OUTLET_DEPTH + 1]; // what was in flight at a time, for the next ones
+    unsigned n_spare;
+    bool retired;
     bool busy; // the thread is at work on one of its items
     bool awaits;
     enum journal_result status;
@@ -73,25 +77,54 @@ struct publisher {
 
 // ---- Buffers ----------------------------------------------------------------------------------
 
-struct outlet_frame *publish_buffer(size_t bytes) {
-    struct outlet_frame *frame = calloc(1, sizeof *frame);
-    if (frame == NULL)
-        return NULL;
-    size_t rounded = (bytes + FRAME_ALIGN - 1) / FRAME_ALIGN * FRAME_ALIGN;
-    frame->frame = aligned_alloc(FRAME_ALIGN, rounded);
-    if (frame->frame == NULL) {
-        free(frame);
-        return NULL;
-    }
-    frame->info.bytes = bytes;
-    return frame;
-}
+// Buffers are used again: fresh pages cost more than what is written into them, and blocks of this
+// size that come and go between others would leave gaps in malloc's arena, several times their
+// size.
 
-void publish_drop(struct outlet_frame *frame) {
+static void buffer_free(struct outlet_frame *frame) {
     if (frame == NULL)
         return;
     free(frame->frame);
     free(frame);
+}
+
+struct outlet_frame *publish_buffer(struct outlet *o, size_t bytes) {
+    struct outlet_frame *frame = NULL;
+    pthread_mutex_lock(&o->publisher->lock);
+    if (o->n_spare > 0)
+        frame = o->spare[--o->n_spare];
+    pthread_mutex_unlock(&o->publisher->lock);
+    if (frame != NULL && (frame->room < bytes || frame->room / 2 > bytes + SPARE_SLACK)) {
+        buffer_free(frame);
+        frame = NULL;
+    }
+    if (frame == NULL) {
+        frame = calloc(1, sizeof *frame);
+        if (frame == NULL)
+            return NULL;
+        frame->room = (bytes / SPARE_SLACK + 1) * SPARE_SLACK; // headers differ by some digits
+        frame->frame = aligned_alloc(FRAME_ALIGN, frame->room);
+        if (frame->frame == NULL) {
+            free(frame);
+            return NULL;
+        }
+    }
+    frame->info = (struct journal_frame){.bytes = bytes};
+    return frame;
+}
+
+// Called with the lock.
+static void give_back(struct outlet *o, struct outlet_frame *frame) {
+    if (frame != NULL && !o->retired && o->n_spare < sizeof o->spare / sizeof *o->spare)
+        o->spare[o->n_spare++] = frame;
+    else
+        buffer_free(frame);
+}
+
+void publish_drop(struct outlet *o, struct outlet_frame *frame) {
+    pthread_mutex_lock(&o->publisher->lock);
+    give_back(o, frame);
+    pthread_mutex_unlock(&o->publisher->lock);
 }
 
 static void message_free(void *bytes, void *hint) {
@@ -301,7 +334,7 @@ static void work_on(struct publisher *p, struct outlet *o) {
             o->last = NULL;
         if (item->frame != NULL) {
             o->n_frames--;
-            publish_drop(item->frame);
+            give_back(o, item->frame);
         } else {
             o->n_events--;
             free(item->event);
@@ -457,7 +490,7 @@ struct outlet *publish_open(struct publisher *publisher, const char *run, struct
 }
 
 static void item_free(struct item *item) {
-    publish_drop(item->frame);
+    buffer_free(item->frame);
     free(item->event);
     free(item);
 }
@@ -484,6 +517,9 @@ void publish_retire(struct outlet *o) {
     struct publisher *p = o->publisher;
     pthread_mutex_lock(&p->lock);
     struct item *first = take_queue(o);
+    o->retired = true;
+    while (o->n_spare > 0)
+        buffer_free(o->spare[--o->n_spare]);
     for (struct outlet **link = &p->outlets; *link != NULL; link = &(*link)->next)
         if (*link == o) {
             *link = o->next;
@@ -542,7 +578,7 @@ void publish_push(struct outlet *o, struct outlet_frame *frame) {
     }
     pthread_mutex_unlock(&o->publisher->lock);
     if (item == NULL)
-        publish_drop(frame);
+        publish_drop(o, frame);
 }
 
 void publish_event(struct outlet *o, const char *json) {

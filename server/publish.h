@@ -24,6 +24,7 @@ struct publish_counts {
 struct outlet_frame {
     struct journal_frame info;
     unsigned char *frame; // info.bytes bytes, 64-byte aligned
+    size_t room;          // bytes that there is memory for
 };
 
 #define PUBLISH_KEY 41 // bytes of a public key
@@ -57,9 +58,9 @@ bool publish_has_room(struct outlet *outlet);
 // Tries again at once what found no room.
 void publish_retry(struct outlet *outlet);
 // A buffer for a frame of `bytes`, or NULL without memory. Give it back by publish_push or
-// publish_drop.
-struct outlet_frame *publish_buffer(size_t bytes);
-void publish_drop(struct outlet_frame *frame);
+// publish_drop (which takes NULL).
+struct outlet_frame *publish_buffer(struct outlet *outlet, size_t bytes);
+void publish_drop(struct outlet *outlet, struct outlet_frame *frame);
 // Takes the frame: from now on it is the outlet's.
 void publish_push(struct outlet *outlet, struct outlet_frame *frame);
 // Publishes an event that the journal has already, after the frames pushed before it. Copies

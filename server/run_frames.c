@@ -183,7 +183,7 @@ static struct outlet_frame *capture(struct run *r, uint64_t seq, uint64_t epoch,
     }
     struct outlet_frame *frame = NULL;
     if (frame_layout(&plan) == 0)
-        frame = publish_buffer(plan.total_bytes);
+        frame = publish_buffer(r->outlet, plan.total_bytes);
     if (frame != NULL) {
         frame->info = frame_info(&plan, state);
         frame_write_header(&plan, frame->frame);
@@ -203,7 +203,7 @@ void run_frame_take(struct run *r, enum run_state state, bool end) {
     if (again && !there.gone) {
         frame = capture(r, r->next_seq, there.epoch, state, end);
         bool same = frame != NULL && frame_seal(frame->frame) == there.digest;
-        publish_drop(frame);
+        publish_drop(r->outlet, frame);
         if (frame != NULL && !same) {
             run_begin_epoch(r, "the continued run's frames differ from those of the run before");
             again = false;
@@ -259,7 +259,7 @@ struct outlet_frame *run_frame_again(struct run *r, enum run_state state) {
                 frame_field((enum mpm_field)known, plan.count, plan.dimension);
         }
         if (frame_layout(&plan) == 0)
-            frame = publish_buffer(plan.total_bytes);
+            frame = publish_buffer(r->outlet, plan.total_bytes);
     }
     if (frame != NULL) {
         frame->info = frame_info(&plan, state);

@@ -5,7 +5,7 @@ from boxes import merged, water
 from harness import check_same_recording, disturbed, seeded, undisturbed
 
 # Steps of a fraction of a millisecond: some seconds in all, with a checkpoint every tenth of one.
-POOL = water(time={"end": 6, "dt": 2e-4}, output={"interval": 0.01, "probe_interval": 0.002, "checkpoint_interval": 0.1})
+POOL = water(time={"end": 16, "dt": 2e-4}, output={"interval": 0.02, "probe_interval": 0.004, "checkpoint_interval": 0.1})
 SWITCHES = [(700, {"fbar": False}), (2500, {"damping": {"local": 0.05}, "gravity": [0.5, -9.81]}),
             (4000, {"fbar": {"scheme": "anchored", "a": 0.05}}), (6000, {"time": {"dt": 1e-4}})]  # fmt: skip
 
