@@ -184,6 +184,18 @@ class Fake:
             if live:
                 self.publish(seq)
 
+    def advance_when_asked(self, times):
+        """One frame, not sent, for each of the first `times` looks at the run."""
+        route, asked = self.route, []
+
+        def advancing(method, path, body, headers):
+            answer = route(method, path, body, headers)
+            if path == f"/v1/runs/{self.run}" and len(asked) < times:
+                asked.append(path)
+                self.advance(live=False)
+            return answer
+        self.route = advancing
+
     def play(self, interval=0.01, live=True):
         def go():
             while self.ready < len(self.frames) and not self.closing:

@@ -99,15 +99,7 @@ def test_colours_are_for_terminals(fbar, fake):
 @pytest.mark.parametrize("columns", [80, 100, 200])
 def test_progress_line_has_everything_in_any_width(fake, columns):
     daemon = fake(n_frames=3)
-    route, asked = daemon.route, []
-
-    def advance_when_asked(method, path, body, headers):
-        answer = route(method, path, body, headers)
-        if path == "/v1/runs/r1" and len(asked) < 3:
-            asked.append(path)
-            daemon.advance(live=False)
-        return answer
-    daemon.route = advance_when_asked
+    daemon.advance_when_asked(3)
     text = on_a_terminal("--url", daemon.url, "watch", "r1", columns=columns)
     line = [ESCAPE.sub("", part) for part in re.split(r"\r(?:\x1b\[K)?", text) if "step" in part][0]
     assert re.search(r"[█░▏▎▍▌▋▊▉]+ +\d+\.\d %  step \d+  t = \S+ s  1 M.*/s  ETA 1 s  F-bar on", line), line

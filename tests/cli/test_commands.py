@@ -206,15 +206,7 @@ def test_watch_exits_with_the_outcome(fbar, fake, start_fbar):
 
 def test_watch_on_a_terminal_redraws_one_line(fake):
     daemon = fake(n_frames=6)
-    route, asked = daemon.route, []
-
-    def advance_when_asked(method, path, body, headers):
-        answer = route(method, path, body, headers)
-        if path == "/v1/runs/r1" and len(asked) < 6:
-            asked.append(path)
-            daemon.advance(live=False)
-        return answer
-    daemon.route = advance_when_asked
+    daemon.advance_when_asked(6)
     result = subprocess.run(["script", "-qec", f"{conftest.FBAR} --url {daemon.url} watch r1",
                              "/dev/null"], capture_output=True, timeout=60,
                             env={**os.environ, "TERM": "xterm", "LC_ALL": "C.UTF-8"})
