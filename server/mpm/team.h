@@ -2,8 +2,8 @@
 //
 // A step is a dozen short pieces of parallel work. To open an OpenMP region for each, and to meet
 // at its barriers, takes some microseconds a piece, as long as a small scene's work itself; threads
-// that stand by for the step take a fraction of that. OpenMP makes the threads and lends them for the
-// step.
+// that stand by for the step take a fraction of that. OpenMP makes the threads and lends them for
+// the step.
 #pragma once
 #include <stdatomic.h>
 
