@@ -3,9 +3,10 @@
 
 100 status requests a second, at fixed times, over 32 connections that are kept; latency counts from the time at which
 a request was due, so that a late client is not flattering, to the answer's arrival at the client's socket (the kernel's
-time stamp). The client wakes once for a request, to send it, and then also takes earlier answers: it is on the same cores. The run never stops; requests come in every other half second,
-and the run's speed then is compared with that in the half seconds beside it: what else goes on on a machine changes more
-slowly than that, and moves both."""
+time stamp). The client is on the same cores as the run. So half seconds of three kinds take turns: nothing is asked;
+the client asks itself, with the same calls at the same times; the client asks the daemon. The run never stops, and its
+speed in a half second is compared with that in those of the other kinds beside it: what else goes on on a machine
+changes more slowly than that, and moves all three. What answering costs is the third against the second."""
 import json
 import os
 import pathlib
@@ -24,12 +25,18 @@ from boxes import big  # noqa: E402
 RATE, CONNECTIONS = 100, 32
 SO_TIMESTAMPNS = 35  # socket(7); of <asm-generic/socket.h>
 SLICE = 0.5  # s; the status is at most 20 ms old, steps and seconds in it are of one moment
-PAIRS = int(os.environ.get("PAIRS", 60))
+TURNS = int(os.environ.get("TURNS", 60))
 
 
 class Connection:
-    def __init__(self, host, request):
-        self.socket = socket.create_connection(host)
+    """To the daemon, or to `listener` of this process: then what is sent is taken at the other end, in the place of
+    an answer."""
+
+    def __init__(self, host, request, listener=None):
+        self.socket, self.other_end = socket.create_connection(host), None
+        if listener is not None:
+            self.other_end, _ = listener.accept()
+            self.socket, self.other_end = self.other_end, self.socket
         self.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self.socket.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
         self.socket.setblocking(False)
@@ -38,7 +45,7 @@ class Connection:
     def send(self, due):
         assert self.due is None, "an answer takes longer than all connections together"
         self.due = due
-        self.socket.sendall(self.request)
+        (self.other_end or self.socket).sendall(self.request)
 
     def receive(self, clock):
         """Seconds from when the request was due to the answer's arrival, or None. `clock`: monotonic less real time."""
@@ -48,6 +55,9 @@ class Connection:
             return None
         assert text, "closed"
         self.text += text
+        if self.other_end is not None:
+            self.due, self.text = None, b""
+            return 0.0
         head, _, body = self.text.partition(b"\r\n\r\n")
         assert head.startswith(b"HTTP/1.1 200"), head[:200]
         if len(body) < int(head.split(b"Content-Length: ")[1].split(b"\r\n")[0]):
@@ -92,19 +102,45 @@ def place(daemon, run):
     return now["step"], now["performance"]["wall_s"]
 
 
-def speeds(daemon, run, connections):
-    """Steps per second and latencies, slice by slice: without requests, with, with, without, ..."""
-    quiet, asked, latencies = [], [], []
-    for pair in range(PAIRS):
-        for with_requests in (pair % 2, 1 - pair % 2):
+def used(daemon):
+    """Processor seconds of the daemon's threads that answer, and of this process."""
+    daemon_s = 0.0
+    for task in pathlib.Path(f"/proc/{daemon.process.pid}/task").iterdir():
+        try:
+            if (task / "comm").read_text().startswith("MHD-connection"):
+                daemon_s += 1e-9 * float((task / "schedstat").read_text().split()[0])
+        except OSError:
+            pass  # it has ended
+    return daemon_s, 1e-9 * float(pathlib.Path("/proc/self/schedstat").read_text().split()[0])
+
+
+NOTHING, ITSELF, DAEMON = range(3)
+
+
+def speeds(daemon, run, connections, own):
+    """Steps per second in half seconds of each kind, latencies, and processor seconds (used())."""
+    found, latencies, costs = ([], [], []), [], [0.0, 0.0]
+    for turn in range(TURNS):
+        for kind in ((NOTHING, ITSELF, DAEMON), (DAEMON, ITSELF, NOTHING))[turn % 2]:
             step, wall = place(daemon, run)
-            if with_requests:
+            if kind == DAEMON:
+                before = used(daemon)
                 latencies += ask_for(connections, SLICE, len(latencies))
+                costs = [c + a - b for c, a, b in zip(costs, used(daemon), before)]
+            elif kind == ITSELF:
+                ask_for(own, SLICE, len(latencies))
             else:
                 time.sleep(SLICE)
             after, wall_after = place(daemon, run)
-            (asked if with_requests else quiet).append((after - step) / (wall_after - wall))
-    return quiet, asked, latencies
+            found[kind].append((after - step) / (wall_after - wall))
+    return found, latencies, costs
+
+
+def loss(before, after):
+    """The median of the turns, and its standard error (1.25 sigma / sqrt(n), sigma from the quartiles)."""
+    losses = [1 - b / a for a, b in zip(before, after)]
+    low, _, high = statistics.quantiles(losses, n=4)
+    return statistics.median(losses), 1.25 * (high - low) / 1.35 / len(losses) ** 0.5
 
 
 def main():
@@ -117,8 +153,10 @@ def main():
         host, port = daemon.host.split(":")
         request = f"GET /v1/runs/{run} HTTP/1.1\r\nHost: {daemon.host}\r\n\r\n".encode()
         connections = [Connection((host, int(port)), request) for _ in range(CONNECTIONS)]
-        quiet, asked, latencies = speeds(daemon, run, connections)
-        for c in connections:
+        with socket.create_server(("127.0.0.1", 0)) as listener:
+            own = [Connection(listener.getsockname(), request, listener) for _ in range(CONNECTIONS)]
+        found, latencies, costs = speeds(daemon, run, connections, own)
+        for c in connections + own:
             c.socket.close()
         particles = daemon.run(run)["particles"]
         daemon.away(run)
@@ -128,19 +166,19 @@ def main():
     def at(share):
         return 1e3 * latencies[min(len(latencies) - 1, int(share * len(latencies)))]
 
-    # The median of the pairs, and its standard error (1.25 sigma / sqrt(n), sigma from the quartiles).
-    losses = sorted(1 - b / a for a, b in zip(quiet, asked))
-    loss = statistics.median(losses)
-    low, _, high = statistics.quantiles(losses, n=4)
-    error = 1.25 * (high - low) / 1.35 / len(losses) ** 0.5
+    answering, answering_error = loss(found[ITSELF], found[DAEMON])
+    both, both_error = loss(found[NOTHING], found[DAEMON])
     million = 1e-6 * particles
+    quiet, itself, asked = (million * statistics.median(f) for f in found)
     print(f"{len(latencies)} status requests at {RATE}/s over {CONNECTIONS} connections, a run of {particles} particles on "
           f"{threads} threads, load {os.getloadavg()[0]:.1f}")
     print(f"latency: median {at(0.5):.2f} ms (wanted <= 2), 99 % {at(0.99):.2f} ms (wanted <= 10), most {at(1):.2f} ms")
-    print(f"the run: {million * statistics.median(quiet):.2f} -> {million * statistics.median(asked):.2f} million "
-          f"particle-steps/s; loss {100 * loss:.1f} +- {100 * error:.1f} % (wanted <= 3), median of {len(losses)} pairs, "
-          "the client's own work on the same cores included")
-    print(json.dumps({"median_ms": at(0.5), "p99_ms": at(0.99), "loss": loss, "loss_error": error}))
+    print(f"the run: {quiet:.2f}, while the client asks itself {itself:.2f}, the daemon {asked:.2f} million particle-steps/s; "
+          f"loss by answering {100 * answering:.1f} +- {100 * answering_error:.1f} % (wanted <= 3), with the client's own "
+          f"work on the same cores {100 * both:.1f} +- {100 * both_error:.1f} %; medians of {TURNS} turns")
+    in_daemon, in_client = (1e6 * c / len(latencies) for c in costs)
+    print(f"a request: {in_daemon:.0f} us of the processor in the daemon, {in_client:.0f} us in this client")
+    print(json.dumps({"median_ms": at(0.5), "p99_ms": at(0.99), "loss": answering, "loss_error": answering_error, "loss_with_client": both}))
 
 
 main()

@@ -612,11 +612,9 @@ static void number_text(char out[32], double value) {
         snprintf(out, 32, "%lld", (long long)value); // most are counts, and this is the same text
         return;
     }
-    for (int digits = 15; digits <= 17; digits++) {
-        snprintf(out, 32, "%.*g", digits, value);
-        if (strtod(out, NULL) == value)
-            return;
-    }
+    snprintf(out, 32, "%.15g", value);
+    if (strtod(out, NULL) != value)
+        snprintf(out, 32, "%.17g", value); // always the same double
 }
 
 // Makes the number an item that cJSON prints as it stands (and that keeps its valuedouble).
@@ -655,8 +653,13 @@ char *json_print(const cJSON *json, bool indented) {
     return text;
 }
 
+// Most answers fit: growing by doubling, cJSON copies them several times.
+#define PRINTED_BYTES 4096
+
 char *json_print_away(cJSON *json) {
-    char *text = json != NULL && numbers_to_raw(json) ? cJSON_PrintUnformatted(json) : NULL;
+    char *text = json != NULL && numbers_to_raw(json)
+                     ? cJSON_PrintBuffered(json, PRINTED_BYTES, false)
+                     : NULL;
     cJSON_Delete(json);
     return text;
 }

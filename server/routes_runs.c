@@ -71,17 +71,23 @@ static cJSON *balance_json(const struct run_status *status) {
     return json;
 }
 
+// Of clocks: a microsecond is what they are good for, and short numbers are printed quickly.
+static double shown_seconds(double value) {
+    return round(1e6 * value) / 1e6;
+}
+
 static cJSON *performance_json(const struct run_status *status) {
     cJSON *json = cJSON_CreateObject(), *phases;
     double work = (double)status->particles * (double)status->step;
-    reply_add(json, "wall_s", status->wall_s);
-    reply_add(json, "particle_steps_per_s", status->wall_s > 0 ? work / status->wall_s : NAN);
+    reply_add(json, "wall_s", shown_seconds(status->wall_s));
+    reply_add(json, "particle_steps_per_s",
+              status->wall_s > 0 ? round(work / status->wall_s) : NAN);
     reply_add(json, "bytes_per_particle",
               status->particles > 0 ? (double)status->bytes / (double)status->particles : NAN);
     reply_add(json, "threads", status->threads > 0 ? status->threads : NAN);
     phases = cJSON_AddObjectToObject(json, "phases");
     for (int k = 0; k < RUN_N_PHASES; k++)
-        reply_add(phases, run_phase_name(k), status->phases[k]);
+        reply_add(phases, run_phase_name(k), shown_seconds(status->phases[k]));
     return json;
 }
 
@@ -114,7 +120,7 @@ cJSON *routes_run_json(struct run *run) {
     reply_add(json, "end_time", status.end_time);
     reply_add(json, "stage", (double)status.stage);
     reply_add(json, "progress", routes_progress(&status));
-    reply_add(json, "eta_s", status.eta_s);
+    reply_add(json, "eta_s", shown_seconds(status.eta_s));
     reply_add(json, "dt", status.dt);
     reply_add(json, "dt_limit", status.dt_limit);
     cJSON_AddBoolToObject(json, "fbar", status.fbar);
@@ -131,8 +137,7 @@ cJSON *routes_run_json(struct run *run) {
     cJSON *changes = run_changes(run), *newest = NULL;
     if (changes != NULL && changes->child != NULL)
         newest = changes->child->prev; // the last one, with cJSON
-    reply_add(json, "revision",
-              newest != NULL ? json_member(newest, "revision")->valuedouble : 0);
+    reply_add(json, "revision", newest != NULL ? json_member(newest, "revision")->valuedouble : 0);
     cJSON_AddItemToObject(json, "changes", changes);
     cJSON_AddItemToObject(json, "journal", routes_journal_json(run));
     cJSON_AddItemToObject(json, "recorders", routes_recorders_json(run));
@@ -242,7 +247,16 @@ void routes_serve_run(struct call *c) {
     struct run *run = routes_run_of(c);
     if (run == NULL)
         return;
-    reply_json(c->reply, 200, routes_run_json(run));
+    struct run_view view;
+    const bool plain = run_view(run, &view);
+    char *kept = plain ? run_view_text(run, &view) : NULL;
+    if (kept != NULL) {
+        reply_text(c->reply, 200, "application/json", kept);
+    } else {
+        reply_json(c->reply, 200, routes_run_json(run));
+        if (plain && c->reply->body != NULL)
+            run_view_keep(run, &view, c->reply->body);
+    }
     run_release(run);
 }
 

@@ -346,6 +346,7 @@ static void run_free(struct run *r) {
     recorders_free(r->recorders);
     journal_close(r->journal);
     cJSON_Delete(r->changes);
+    free(r->view);
     cJSON_Delete(r->replay.scene);
     history_free(&r->history);
     history_meta_free(&r->meta);

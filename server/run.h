@@ -137,8 +137,8 @@ struct run_host {
     struct run_bell *bell;     // may be NULL
 };
 
-// Particles that repay a thread: with fewer each, the barriers of a step take longer than its work is
-// shortened by, many times longer where other programs want the cores (`make bench-threads`).
+// Particles that repay a thread: with fewer each, the barriers of a step take longer than its work
+// is shortened by, many times longer where other programs want the cores (`make bench-threads`).
 #define RUN_PARTICLES_PER_THREAD 8192
 // Solver threads of a run of so many particles. Its results do not depend on them.
 int run_threads(const struct run_host *host, uint64_t particles);
@@ -186,7 +186,7 @@ const char *run_request(const struct run *run); // and the digest of that reques
 struct run_status run_status(struct run *run);
 char *run_scene_text(struct run *run);                      // JSON as run; the caller frees it
 char *run_config_text(struct run *run, uint64_t *revision); // the settable part of it
-#define RUN_CHANGES 32 // of the configuration that a run object tells of: the newest
+#define RUN_CHANGES 32               // of the configuration that a run object tells of: the newest
 cJSON *run_changes(struct run *run); // [{revision, step, time, patch}] of them; new
 struct series *run_series(struct run *run);       // NULL before there are probes
 struct journal *run_journal(struct run *run);     // NULL when its folder is damaged
@@ -198,6 +198,15 @@ bool run_stopping(const struct run *run); // the daemon ends
 // A viewer over HTTP, who counts among those that a run waits for.
 void run_viewers(struct run *run, int change);
 void run_nudge(struct run *run); // a recorder has acknowledged frames or is gone: there may be room
+// Who asks often, or many who ask at once, mostly ask for what has been said already. Two views of
+// a run that are equal make the same run object; take the view before what it is made of.
+struct run_view {
+    uint64_t version, frames, frames_gone, frame_bytes, samples;
+};
+// False where the object tells of a clock: of how long a recorder has been silent.
+bool run_view(struct run *run, struct run_view *out);
+char *run_view_text(struct run *run, const struct run_view *view); // as it was kept, new; or NULL
+void run_view_keep(struct run *run, const struct run_view *view, const char *text);
 const struct run_reference *run_references(const struct run *run, size_t *count);
 
 enum run_outcome {

@@ -38,6 +38,9 @@ struct run {
     unsigned n_queued;
     bool accepts;             // commands are still being answered
     struct run_status status; // the copy that others read
+    uint64_t version;         // of what others read here
+    struct run_view viewed;   // what `view` tells of
+    char *view;               // see run_view_text(); NULL before it was asked for
     char *scene_text, *config_text;
     cJSON *changes;        // of the configuration, as the API tells them
     struct series *series; // set once
@@ -127,7 +130,7 @@ void run_power(struct run *run); // the journal's durability as configured; warn
 enum run_outcome run_configure(struct run *run, struct run_command *command);
 const struct history_change *run_change_due(const struct run *run); // NULL when there is none
 void run_change_next(struct run *run);                              // makes it again
-void run_changes_forget(struct run *run); // once all are made again
+void run_changes_forget(struct run *run);                           // once all are made again
 bool run_replay_scene(struct run *run);
 
 // ---- run_checkpoint.c

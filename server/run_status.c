@@ -161,8 +161,45 @@ void run_status_publish(struct run *r, bool exact) {
     struct run_status copy = run_status_until_now(r);
     pthread_mutex_lock(&r->lock);
     r->status = copy;
+    r->version++;
     pthread_mutex_unlock(&r->lock);
     r->last_published = run_clock();
+}
+
+bool run_view(struct run *r, struct run_view *out) {
+    struct recorder recorders[RECORDERS_MAX];
+    *out = (struct run_view){0};
+    if (r->recorders != NULL && recorders_list(r->recorders, recorders) > 0)
+        return false;
+    if (r->journal != NULL) {
+        out->frames = journal_n_frames(r->journal);
+        out->frames_gone = journal_n_gone(r->journal);
+        out->frame_bytes = journal_frame_bytes(r->journal);
+    }
+    pthread_mutex_lock(&r->lock);
+    struct series *series = r->series;
+    out->version = r->version;
+    pthread_mutex_unlock(&r->lock);
+    out->samples = series != NULL ? series_n_rows(series) : 0;
+    return true;
+}
+
+char *run_view_text(struct run *r, const struct run_view *view) {
+    pthread_mutex_lock(&r->lock);
+    char *text =
+        r->view != NULL && memcmp(&r->viewed, view, sizeof *view) == 0 ? strdup(r->view) : NULL;
+    pthread_mutex_unlock(&r->lock);
+    return text;
+}
+
+void run_view_keep(struct run *r, const struct run_view *view, const char *text) {
+    char *kept = strdup(text);
+    pthread_mutex_lock(&r->lock);
+    char *old = r->view;
+    r->view = kept;
+    r->viewed = *view;
+    pthread_mutex_unlock(&r->lock);
+    free(old);
 }
 
 // What the run object tells of a change that is in the log.
@@ -176,6 +213,7 @@ static void remember_change(struct run *r, const cJSON *event) {
     cJSON_AddItemToArray(r->changes, change);
     if (cJSON_GetArraySize(r->changes) > RUN_CHANGES)
         cJSON_DeleteItemFromArray(r->changes, 0);
+    r->version++;
     pthread_mutex_unlock(&r->lock);
 }
 

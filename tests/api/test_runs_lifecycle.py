@@ -336,6 +336,27 @@ def test_wall_time_stands_still_while_paused(daemon, name):
     daemon.away(name)
 
 
+def test_a_kept_run_object_is_told_only_while_nothing_has_changed(daemon, name):
+    path, recorder = f"/v1/runs/{name}", f"/v1/runs/{name}/recorders/somebody"
+    daemon.create(endless(), id=name, start=False)
+    daemon.wait(name, "paused")
+    seen = daemon.get(path)
+    assert daemon.get(path) == seen == next(r for r in daemon.get("/v1/runs")["runs"] if r["id"] == name)
+    daemon.ask("PUT", recorder, {"acked": -1})
+    assert [r["name"] for r in daemon.get(path)["recorders"]] == ["somebody"]
+    daemon.ask("DELETE", recorder)
+    assert daemon.get(path) == seen
+    daemon.patch(name, {"time": {"end": 50}})
+    changed = daemon.get(path)
+    assert (changed["revision"], changed["end_time"], len(changed["changes"])) == (1, 50, 1)
+    for step in range(1, 6):  # each with a frame
+        daemon.act(name, "step", {"steps": 1})
+        now = until(lambda: (r := daemon.get(path))["step"] == step and r["state"] == "paused" and r)
+        assert daemon.get(path) == now
+    assert now["journal"]["frames"] == len(daemon.frames(name))
+    daemon.away(name)
+
+
 def test_progress_and_eta_while_running(daemon, name):
     daemon.create(endless(time={"end": 100}), id=name)
     run = until(lambda: (r := daemon.run(name))["eta_s"] is not None and r)
