@@ -75,8 +75,10 @@ LANES.v4 = -march=x86-64-v4 -mprefer-vector-width=512 -DMPM_LANES=8
 levels = $(foreach level,$(LEVELS),$(patsubst %.c,$(B)/obj/%.$(level).o,$(1)))
 lanes = $(call obj,$(1)) $(call levels,$(1))
 $(B)/obj/server/mpm/kernels.o: ALL_CFLAGS += $(if $(LEVELS),-DMPM_HAS_LANES)
-# Written in vectors: what the compiler would vectorise or unroll besides is scalar for a reason.
-LANES_FLAGS = $(if $(filter asan tsan debug coverage,$(VARIANT)),-O1,-O2) -fno-tree-vectorize -fno-tree-slp-vectorize
+# Written in vectors: what the compiler would vectorise besides is scalar for a reason. Loops over components are to be
+# unrolled, or these live in memory: GCC does so from -fpeel-loops on, clang always.
+PEEL = $(if $(findstring clang,$(CC)),,-fpeel-loops)
+LANES_FLAGS = $(if $(filter asan tsan debug coverage,$(VARIANT)),-O1,-O2 $(PEEL)) -fno-tree-vectorize -fno-tree-slp-vectorize
 $(call levels,$(LANES_SRC)): ALL_CFLAGS += $(LANES_FLAGS)
 
 .PHONY: studies all programs deps deps-page deps-long deps-report libmpm demo report report-page report-docs check check-all check-layers check-unit \

@@ -45,37 +45,28 @@ double wall_now(void) {
 #if defined __x86_64__
 #include <immintrin.h>
 // Seconds of one fused multiply-add of the widest vectors, with enough of them independent.
+// Variables of their own, not an array: that the compiler might keep in memory.
+#define EACH_12(X) X(a) X(b) X(c) X(d) X(e) X(f) X(g) X(h) X(i) X(j) X(k) X(l)
+#define DECLARE(a) a = y,
+#define MULTIPLY_ADD_512(a) a = _mm512_fmadd_pd(a, x, y); __asm__ volatile("" : "+v"(a));
+#define MULTIPLY_ADD_256(a) a = _mm256_fmadd_pd(a, x, y); __asm__ volatile("" : "+x"(a));
 __attribute__((target("avx512f"))) static double fma_512(long n) {
-    __m512d a[12];
-    for (int i = 0; i < 12; i++) {
-        a[i] = _mm512_set1_pd(i);
+    const __m512d x = _mm512_set1_pd(0.9999999), y = _mm512_set1_pd(1e-9);
+    __m512d EACH_12(DECLARE) last;
+    const double begin = now();
+    for (long left = n; left > 0; left -= 12) {
+        EACH_12(MULTIPLY_ADD_512)
     }
-    const __m512d x = _mm512_set1_pd(1.0000001), y = _mm512_set1_pd(1e-9);
-    const double t = now();
-    for (long k = 0; k < n; k += 12) {
-#pragma GCC unroll 12
-        for (int i = 0; i < 12; i++) {
-            a[i] = _mm512_fmadd_pd(a[i], x, y);
-            __asm__ volatile("" : "+v"(a[i]));
-        }
-    }
-    return (now() - t) / (double)n;
+    return (void)last, (now() - begin) / (double)n;
 }
 __attribute__((target("avx2,fma"))) static double fma_256(long n) {
-    __m256d a[12];
-    for (int i = 0; i < 12; i++) {
-        a[i] = _mm256_set1_pd(i);
+    const __m256d x = _mm256_set1_pd(0.9999999), y = _mm256_set1_pd(1e-9);
+    __m256d EACH_12(DECLARE) last;
+    const double begin = now();
+    for (long left = n; left > 0; left -= 12) {
+        EACH_12(MULTIPLY_ADD_256)
     }
-    const __m256d x = _mm256_set1_pd(1.0000001), y = _mm256_set1_pd(1e-9);
-    const double t = now();
-    for (long k = 0; k < n; k += 12) {
-#pragma GCC unroll 12
-        for (int i = 0; i < 12; i++) {
-            a[i] = _mm256_fmadd_pd(a[i], x, y);
-            __asm__ volatile("" : "+x"(a[i]));
-        }
-    }
-    return (now() - t) / (double)n;
+    return (void)last, (now() - begin) / (double)n;
 }
 #endif
 
@@ -83,10 +74,10 @@ __attribute__((target("avx2,fma"))) static double fma_256(long n) {
 double fma_seconds(void) {
 #if defined __x86_64__
     if (mpm_isa_available(MPM_ISA_AVX512)) {
-        return fma_512(3000000) / 8;
+        return fma_512(12000000) / 8;
     }
     if (mpm_isa_available(MPM_ISA_AVX2)) {
-        return fma_256(3000000) / 4;
+        return fma_256(12000000) / 4;
     }
 #endif
     return NAN;

@@ -4,6 +4,8 @@
 #include <stdlib.h>
 #include <string.h>
 
+#include "server/mpm/memory.h"
+
 #define FIRST_CAPACITY 32 // slots
 
 bool mpm_grid_layout(struct mpm_grid *grid, const struct mpm_def *def) {
@@ -41,11 +43,7 @@ size_t mpm_grid_bytes(const struct mpm_grid *g, uint32_t slots, int fbar_scalars
 static double *take(const struct mpm_grid *g, uint32_t capacity, int components) {
     const size_t bytes =
         capacity * (size_t)MPM_BLOCK_NODES(g->dim) * (size_t)components * sizeof(double);
-    double *memory = aligned_alloc(64, bytes);
-    if (memory) {
-        memset(memory, 0, bytes);
-    }
-    return memory;
+    return mpm_memory(bytes);
 }
 
 // The sums and results of a step do not outlive it, so nothing is copied.

@@ -5,6 +5,7 @@
 #include <string.h>
 
 #include "server/mpm/basis.h"
+#include "server/mpm/memory.h"
 
 #define DIGIT 11 // bits of one pass of the radix sort: its counters fit the first-level cache
 #define N_DIGITS (1 << DIGIT)
@@ -20,7 +21,7 @@ size_t mpm_sorter_bytes(size_t n, int n_threads) {
 
 bool mpm_sorter_create(struct mpm_sorter *sorter, size_t n, struct mpm_team *team) {
     *sorter = (struct mpm_sorter){.team = team, .bytes = mpm_sorter_bytes(n, team->n_threads)};
-    char *memory = aligned_alloc(64, sorter->bytes);
+    char *memory = mpm_memory(sorter->bytes);
     if (!memory) {
         return false;
     }
@@ -45,6 +46,7 @@ void mpm_order_free(struct mpm_order *order) {
     free(order->work_before);
     free(order->done);
     free(order->share);
+    free(order->when);
     *order = (struct mpm_order){0};
 }
 
@@ -66,7 +68,7 @@ bool mpm_order_reserve(struct mpm_order *order, size_t n) {
         !resize(&order->before_begin, (room + 1) * sizeof *order->before_begin) ||
         !resize(&order->work_before, (room + 1) * sizeof *order->work_before) ||
         !resize(&order->done, room * sizeof *order->done) ||
-        !resize(&order->share, room * sizeof *order->share)) {
+        !resize(&order->share, room * sizeof *order->share) || !resize(&order->when, room)) {
         return false;
     }
     order->capacity = room;
@@ -341,20 +343,83 @@ size_t mpm_order_part(const struct mpm_order *order, int k, int n) {
     return lo;
 }
 
-void mpm_order_share(struct mpm_order *order, int n) {
+// When a part comes to a tile: first those that tiles of other parts wait for, last those that wait
+// for tiles of other parts, each with what has to come before or after it.
+enum when { BETWEEN, FIRST, LAST, PLACED };
+
+static void find_first_and_last(struct mpm_order *order, int n) {
+    memset(order->when, BETWEEN, order->n_tiles);
     for (int k = 0; k < n; k++) {
         const size_t begin = mpm_order_part(order, k, n), end = mpm_order_part(order, k + 1, n);
-        size_t next[MPM_MAX_COLOURS + 1] = {0};
         for (size_t t = begin; t < end; t++) {
-            next[order->colour[t] + 1]++;
+            for (uint32_t b = order->before_begin[t]; b < order->before_begin[t + 1]; b++) {
+                const uint32_t q = order->before[b];
+                if (q < begin || q >= end) {
+                    order->when[q] = FIRST;
+                    order->when[t] = order->when[t] == FIRST ? FIRST : LAST;
+                }
+            }
         }
-        next[0] = begin;
-        for (int colour = 0; colour < order->n_colours; colour++) {
-            next[colour + 1] += next[colour];
+    }
+    for (int step = 0; step < 2 * order->n_colours; step++) { // colours down, then up
+        const bool down = step < order->n_colours;
+        const int colour = down ? order->n_colours - 1 - step : step - order->n_colours;
+        for (int k = 0; k < n; k++) {
+            const size_t begin = mpm_order_part(order, k, n), end = mpm_order_part(order, k + 1, n);
+            for (size_t t = begin; t < end; t++) {
+                if (order->colour[t] != colour || (down && order->when[t] != FIRST)) {
+                    continue;
+                }
+                for (uint32_t b = order->before_begin[t]; b < order->before_begin[t + 1]; b++) {
+                    const uint32_t q = order->before[b];
+                    if (down && q >= begin && q < end) {
+                        order->when[q] = FIRST;
+                    } else if (!down && order->when[q] == LAST && order->when[t] != FIRST) {
+                        order->when[t] = LAST;
+                    }
+                }
+            }
         }
+    }
+}
+
+// The tiles of a part that are done at a time, by colour; shared out from `at` on. Returns where
+// they end.
+static size_t share_by_colour(struct mpm_order *order, size_t begin, size_t end, enum when when,
+                              size_t at) {
+    for (int colour = 0; colour < order->n_colours; colour++) {
         for (size_t t = begin; t < end; t++) {
-            order->share[next[order->colour[t]]++] = (uint32_t)t;
+            if (order->colour[t] == colour && order->when[t] == when) {
+                order->share[at++] = (uint32_t)t;
+            }
         }
+    }
+    return at;
+}
+
+// A tile, after those that it waits for, which have lower colours: the calls end soon.
+static size_t share_in_place(struct mpm_order *order, size_t t, size_t at) {
+    order->when[t] = PLACED;
+    for (uint32_t b = order->before_begin[t]; b < order->before_begin[t + 1]; b++) {
+        if (order->when[order->before[b]] == BETWEEN) {
+            at = share_in_place(order, order->before[b], at);
+        }
+    }
+    order->share[at] = (uint32_t)t;
+    return at + 1;
+}
+
+void mpm_order_share(struct mpm_order *order, int n) {
+    find_first_and_last(order, n);
+    for (int k = 0; k < n; k++) {
+        const size_t begin = mpm_order_part(order, k, n), end = mpm_order_part(order, k + 1, n);
+        size_t at = share_by_colour(order, begin, end, FIRST, begin);
+        for (size_t t = begin; t < end; t++) {
+            if (order->when[t] == BETWEEN) {
+                at = share_in_place(order, t, at);
+            }
+        }
+        share_by_colour(order, begin, end, LAST, at);
     }
     order->n_parts = n;
 }

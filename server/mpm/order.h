@@ -35,10 +35,12 @@ struct mpm_order {
         *work_before;  // (n_tiles + 1) particles of the tiles before, and what tiles cost besides
     atomic_uint *done; // (n_tiles) the pass in which a tile has last been done
     unsigned pass;
-    // The tiles in parts of about equal work, each of them by colour: shares [mpm_order_part(k),
-    // mpm_order_part(k + 1)) are part k of n_parts (0: not shared out yet).
+    // The tiles in parts of about equal work, each in an order that keeps what they wait for and
+    // is near that of memory: shares [mpm_order_part(k), mpm_order_part(k + 1)) are part k of
+    // n_parts (0: not shared out yet).
     uint32_t *share;
     int n_parts;
+    uint8_t *when; // (n_tiles) for sharing out
 };
 
 // Memory for sorting any body of up to n particles.

@@ -4,6 +4,8 @@
 #include <stdlib.h>
 #include <string.h>
 
+#include "server/mpm/memory.h"
+
 #define ALIGNMENT 64 // one cache line, one AVX-512 register
 
 #define N_ARRAYS 11
@@ -77,11 +79,10 @@ bool mpm_particles_create(struct mpm_particles *s, size_t n, unsigned wanted) {
     s->n = n;
     s->capacity = whole_blocks(n);
     s->memory_bytes = carve(s, NULL, wanted);
-    s->memory = aligned_alloc(ALIGNMENT, s->memory_bytes);
+    s->memory = mpm_memory(s->memory_bytes);
     if (!s->memory) {
         return false;
     }
-    memset(s->memory, 0, s->memory_bytes);
     carve(s, s->memory, wanted);
     for (size_t p = 0; p < n; p++) {
         s->id[p] = (uint32_t)p;
@@ -111,11 +112,10 @@ bool mpm_particles_add_fbar(struct mpm_particles *s) {
         return true;
     }
     const size_t bytes = fbar_bytes(s->dim, s->capacity);
-    s->fbar_memory = aligned_alloc(ALIGNMENT, bytes);
+    s->fbar_memory = mpm_memory(bytes);
     if (!s->fbar_memory) {
         return false;
     }
-    memset(s->fbar_memory, 0, bytes);
     s->fbar_bytes = bytes;
     s->dx = s->fbar_memory;
     s->dJ = s->dx + s->capacity * (size_t)s->dim;

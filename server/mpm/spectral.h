@@ -11,6 +11,10 @@
 MPM_KERNEL void mpm_half_log(const mpm_vec *b, mpm_vec *e, const int dim);
 // exp(2 e), its inverse.
 MPM_KERNEL void mpm_exp_twice(const mpm_vec *e, mpm_vec *b, const int dim);
+// The same of a strain whose deviator has shrunk: exp(2 (mean 1 + (1 - part) D)), from b = exp(2
+// (mean 1 + D)), which is known.
+MPM_KERNEL void mpm_exp_twice_less(const mpm_vec *b, const mpm_vec *D, mpm_vec part, mpm_vec mean,
+                                   mpm_vec *less, const int dim);
 
 // The same by eigenvalues, for any size, of those of n_lanes tensors whose bit is set in `lanes`:
 // component k of tensor i is b[k * n_lanes + i].
@@ -143,4 +147,43 @@ MPM_KERNEL void mpm_exp_twice(const mpm_vec *e, mpm_vec *b, const int dim) {
     const mpm_vec scale = mpm_exp(2.0 * mean);
     mpm_quadratic(scale * p0, scale * p1, scale * p2, A, A2, b, dim);
     mpm_far_lanes(mpm_exp_twice_far, norm2 <= MPM_SERIES_REACH * MPM_SERIES_REACH, e, b, dim);
+}
+
+// b exp(A) with A = -2 part D, which commutes with b. The series to A^7, by powers of A's
+// invariants J2 = -I2 and J3 = I3, all that does not depend on `part` apart: it comes late.
+#define MPM_SHORT_REACH 0.028 // of A's norm: the next term is 1e-17
+MPM_KERNEL void mpm_exp_twice_less(const mpm_vec *b, const mpm_vec *D, mpm_vec part, mpm_vec mean,
+                                   mpm_vec *less, const int dim) {
+    mpm_vec bD[6], bD2[6];
+    mpm_commuting_product(b, D, bD, dim);
+    mpm_commuting_product(bD, D, bD2, dim);
+    mpm_vec norm2 = mpm_splat(0);
+    for (int k = 0; k < MPM_SYM(dim); k++) {
+        norm2 += (k < 3 ? 1.0 : 2.0) * D[k] * D[k];
+    }
+    const mpm_vec half_norm2 = 0.5 * norm2, det = mpm_det_sym(D, dim);
+    const mpm_vec s = -2.0 * part, s2 = s * s;
+    const mpm_vec J2 = s2 * half_norm2, J3 = s2 * (s * det), J22 = J2 * J2, J23 = J2 * J3;
+    const mpm_vec J33 = J3 * J3;
+    const mpm_vec p0 =
+        1.0 + (J3 * (1.0 / 6) + J23 * (1.0 / 120)) + (J33 * (1.0 / 720) + J22 * J3 * (1.0 / 5040));
+    const mpm_vec p1 = (1.0 + J2 * (1.0 / 6) + J3 * (1.0 / 24)) +
+                       (J22 * (1.0 / 120) + J23 * (1.0 / 360)) + (J33 + J22 * J2) * (1.0 / 5040);
+    const mpm_vec p2 =
+        (0.5 + J2 * (1.0 / 24) + J3 * (1.0 / 120)) + (J22 * (1.0 / 720) + J23 * (1.0 / 2520));
+    const mpm_vec p1_s = p1 * s, p2_s2 = p2 * s2;
+    for (int k = 0; k < MPM_SYM(dim); k++) {
+        less[k] = p0 * b[k] + (p1_s * bD[k] + p2_s2 * bD2[k]);
+    }
+    const mpm_mask near = s2 * norm2 <= MPM_SHORT_REACH * MPM_SHORT_REACH;
+    if (MPM_UNLIKELY(!mpm_all(near))) {
+        mpm_vec e[6], far[6];
+        for (int k = 0; k < MPM_SYM(dim); k++) {
+            e[k] = k < 3 ? mean + (1.0 - part) * D[k] : (1.0 - part) * D[k];
+        }
+        mpm_exp_twice(e, far, dim);
+        for (int k = 0; k < MPM_SYM(dim); k++) {
+            less[k] = mpm_select(near, less[k], far[k]);
+        }
+    }
 }

@@ -116,9 +116,10 @@ static bool take(struct mpm_turn *turn, bool own, size_t *next) {
 
 // Work that adds to the grid goes tile by tile. A tile waits for those near it with lower colours,
 // so that every node's sum has one order whatever the number of threads (order.h). Each thread does
-// its own part of the tiles first, by colour, then what others have not begun. Nobody waits for a
-// tile that nobody will do: of all that are being done, the one with the lowest colour waits for
-// none that is, and a part's next is always done or taken by the one whose part it is.
+// its own part of the tiles first, then what others have not begun. Nobody waits for a tile that
+// nobody will do: those that other parts wait for come first and by colour (order.c), so that of
+// all that are being done there, the one with the lowest colour waits for none that is, and a
+// part's next is always done or taken by the one whose part it is.
 static void work_on_tiles(void *context, int own, int there) {
     const struct particles_work *w = context;
     const struct mpm_order *order = w->order;

@@ -12,6 +12,7 @@ struct hencky_j2 {
     double residual;  // Pa, sqrt(2/3) of the residual strength
     double fall;      // Pa, sqrt(2/3) of the peak's excess over it
     double softening; // 1
+    double per_rate;  // 1, the inverse of sqrt(2/3) softening, 0 without softening
 };
 
 #define HENCKY_J2_ROOT 0.81649658092772603 // sqrt(2/3)
@@ -24,15 +25,10 @@ MPM_KERNEL mpm_vec hencky_j2_soft(const struct hencky_j2 *c, mpm_vec a) {
 // The radial return from |dev tau| = norm, where `yields`: the new plastic strain a, and soft at
 // it. g(x) = norm - 2 mu x - residual - soft(a + sqrt(2/3) x), with x = |d eps_p|, is concave and
 // falling, so Newton's iterates come down to the root from above after the first.
-MPM_KERNEL void hencky_j2_return(const struct hencky_j2 *c, mpm_vec norm, mpm_mask yields,
-                                 mpm_vec *a, mpm_vec *soft) {
-    if (!(c->fall > 0)) {
-        *a = mpm_select(yields, *a + HENCKY_J2_ROOT / c->two_mu * (norm - c->residual), *a);
-        return;
-    }
+MPM_KERNEL mpm_vec hencky_j2_far_return(const struct hencky_j2 *c, mpm_vec norm, mpm_mask going,
+                                        mpm_vec a, mpm_vec *soft) {
     const double rate = HENCKY_J2_ROOT * c->softening; // soft' = -rate soft
     mpm_vec x = mpm_splat(0);
-    mpm_mask going = yields;
     for (int k = 0; k < 50; k++) { // quadratic: 2 or 3 in practice
         const mpm_vec g = norm - c->two_mu * x - c->residual - *soft;
         const mpm_vec step = g / (c->two_mu - rate * *soft), d = rate * step;
@@ -44,8 +40,45 @@ MPM_KERNEL void hencky_j2_return(const struct hencky_j2 *c, mpm_vec norm, mpm_ma
         if (!mpm_any(going)) {
             break;
         }
-        *soft = mpm_select(going, hencky_j2_soft(c, *a + HENCKY_J2_ROOT * x), *soft);
+        *soft = mpm_select(going, hencky_j2_soft(c, a + HENCKY_J2_ROOT * x), *soft);
     }
+    return x;
+}
+
+// A step's strain is mostly so small that soft needs no exponential: soft(a + sqrt(2/3) x) =
+// soft(a) (1 - d + h) with d = rate x and h(d) = exp(-d) - 1 + d, its series to d^7. So d = d0 - q
+// h(d) with q = rate soft / (2 mu - rate soft), which two steps of Newton's method from d0 solve:
+// d exceeds the solution by a part of q d/2, (q d/2)^3 and (q d)^5 or less of itself.
+#define HENCKY_J2_REACH 0.02 // of d: the series' next term is 6e-19
+#define HENCKY_J2_SLOPE 1e-3 // of q d
+MPM_KERNEL void hencky_j2_return(const struct hencky_j2 *c, mpm_vec norm, mpm_mask yields,
+                                 mpm_vec *a, mpm_vec *soft) {
+    if (!(c->softening > 0)) {
+        *a = mpm_select(yields, *a + HENCKY_J2_ROOT / c->two_mu * (norm - c->residual - *soft), *a);
+        return;
+    }
+    const double rate = HENCKY_J2_ROOT * c->softening; // soft' = -rate soft
+    const mpm_vec r = rate / (c->two_mu - rate * *soft), q = *soft * r;
+    const mpm_vec above = (norm - c->residual - *soft) * r;
+    const mpm_vec d0 = mpm_min(mpm_max(above, mpm_splat(0)), mpm_splat(HENCKY_J2_REACH));
+    const mpm_vec d2 = d0 * d0;
+    const mpm_vec h0 = d2 * ((0.5 - d0 * (1.0 / 6)) + d2 * ((1.0 / 24 - d0 * (1.0 / 120)) +
+                                                            d2 * (1.0 / 720 - d0 * (1.0 / 5040))));
+    const mpm_vec slope = d0 - h0, curve = 0.5 - 0.5 * slope; // h' and h''/2, here 1/2 exp(-d)
+    const mpm_vec s = q * slope, per_slope = 1.0 - s + s * s; // 1/(1 + s)
+    const mpm_vec one = -(q * h0) * per_slope;
+    const mpm_vec h1 = h0 + one * (slope + one * (curve - one * curve * (1.0 / 3)));
+    const mpm_vec two = -(one + q * h1) * per_slope;
+    const mpm_vec d = d0 + (one + two), h = h1 + two * slope;
+    mpm_vec x = d * c->per_rate, soft_now = *soft * (1.0 - d + h);
+    const mpm_mask far =
+        yields & mpm_not((above <= HENCKY_J2_REACH) & (q * above <= HENCKY_J2_SLOPE));
+    if (MPM_UNLIKELY(mpm_any(far))) {
+        mpm_vec soft_far = *soft;
+        x = mpm_select(far, hencky_j2_far_return(c, norm, far, *a, &soft_far), x);
+        soft_now = mpm_select(far, soft_far, soft_now);
+    }
+    *soft = mpm_select(yields, soft_now, *soft);
     *a = mpm_select(yields, *a + HENCKY_J2_ROOT * x, *a);
 }
 
@@ -66,13 +99,10 @@ MPM_KERNEL void hencky_j2_stress(const struct hencky_j2 *c, mpm_vec *b, mpm_vec 
         const mpm_vec inverse = 1.0 / mpm_max(norm, limit); // ready before the return is
         hencky_j2_return(c, norm, yields, a, &soft);
         const mpm_vec back = mpm_select(yields, (c->residual + soft) * inverse, mpm_splat(1));
-        mpm_vec elastic[6], flowed[6];
+        mpm_vec flowed[6];
+        mpm_exp_twice_less(b, e, 1.0 - back, mean, flowed, dim);
         for (int k = 0; k < MPM_SYM(dim); k++) {
             e[k] *= back;
-            elastic[k] = k < 3 ? e[k] + mean : e[k];
-        }
-        mpm_exp_twice(elastic, flowed, dim);
-        for (int k = 0; k < MPM_SYM(dim); k++) {
             b[k] = mpm_select(yields, flowed[k], b[k]);
         }
     }
@@ -151,6 +181,7 @@ static void prepare(const double *par, void *constants) {
     c->residual = sqrt(2.0 / 3) * residual_strength(par);
     c->fall = sqrt(2.0 / 3) * (par[YIELD_STRENGTH] - residual_strength(par));
     c->softening = c->fall > 0 ? par[SOFTENING] : 0;
+    c->per_rate = c->softening > 0 ? 1 / (HENCKY_J2_ROOT * c->softening) : 0;
 }
 MPM_SPANS_KEEPS_B(hencky_j2)
 
