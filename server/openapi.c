@@ -1,11 +1,12 @@
-// The paths come from the table that routes; the schemas of what goes in and out stand here as
-// JSON.
+// The paths come from the table that routes, the schemas of what goes in from the tables that check
+// it; those of what comes out stand here as JSON.
 #include "server/openapi.h"
 
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 
+#include "server/bodies.h"
 #include "server/routes.h"
 #include "server/scene.h"
 
@@ -66,7 +67,6 @@ static const struct {
      "{\"type\":\"object\",\"required\":[\"scenes\"],\"properties\":{\"scenes\":{\"type\":\""
      "array\",\"items\":{\"type\":\"object\",\"required\":[\"name\",\"title\"],\"properties"
      "\":{\"name\":{\"type\":\"string\"},\"title\":{\"type\":\"string\"}}}}}}"},
-    {"Validate", "{\"type\":\"object\",\"description\":\"a bare scene, or {scene, overrides}\"}"},
     {"Valid",
      "{\"type\":\"object\",\"required\":[\"valid\",\"estimate\",\"warnings\"],\"properties\":{"
      "\"warnings\":{\"type\":\"array\",\"items\":{\"type\":\"string\"}},\"valid\":{"
@@ -75,50 +75,42 @@ static const struct {
      "integer\"},\"nodes\":{\"type\":\"integer\"},\"dt\":{\"type\":\"number\"},\"dt_limit\":"
      "{\"$ref\":\"#/components/schemas/Number\"},\"steps\":{\"type\":\"number\"},\"bytes\":{"
      "\"type\":\"integer\"}}}}}"},
-    {"Create",
-     "{\"type\":\"object\",\"required\":[\"scene\"],\"additionalProperties\":false,\"propert"
-     "ies\":{\"scene\":{\"type\":[\"string\",\"object\"],\"description\":\"name of a built-i"
-     "n scene, or a scene\"},\"overrides\":{\"type\":\"object\",\"description\":\"merge patc"
-     "h (RFC 7396) on the scene\"},\"id\":{\"type\":\"string\",\"pattern\":\"^[A-Za-z0-9][A-"
-     "Za-z0-9._-]{0,63}$\"},\"recorders\":{\"type\":\"array\",\"items\":{\"type\":\"string\"},"
-     "\"maxItems\":64},"
-     "\"start\":{\"type\":\"boolean\",\"default\":true},\"wait_subscri"
-     "bers\":{\"type\":\"integer\",\"minimum\":0,\"maximum\":10000,\"default\":0}}}"},
     {"State",
      "{\"enum\":[\"queued\",\"running\",\"waiting\",\"paused\",\"completed\",\"failed\",\"ca"
      "ncelled\"]}"},
-    {"Run", "{\"type\":\"object\",\"required\":[\"id\",\"state\",\"step\",\"time\",\"end_time\",\"p"
-            "rogress\",\"eta_s\",\"dt\",\"fbar\",\"particles\",\"scene\",\"created\",\"error\",\"wa"
-            "rnings\",\"revision\",\"changes\",\"performance\",\"balance\",\"probes\",\"accuracy\"],"
-            "\"properties\":{\"id\":{"
-            "\"type\":\"string\"},\"state\":{\"$ref\":\"#/components/schemas/State\"},\"step\":{\"t"
-            "ype\":\"integer\"},\"time\":{\"$ref\":\"#/components/schemas/Number\"},\"end_time\":{"
-            "\"$ref\":\"#/components/schemas/Number\"},\"progress\":{\"type\":\"number\",\"minimum"
-            "\":0,\"maximum\":1},\"eta_s\":{\"$ref\":\"#/components/schemas/Number\"},\"dt\":{\"$re"
-            "f\":\"#/components/schemas/Number\"},\"fbar\":{\"type\":\"boolean\"},\"fbar_scheme\":{"
-            "\"type\":\"string\"},\"particles\":{\"type\":\"integer\"},\"scene\":{\"type\":\"string"
-            "\"},\"created\":{\"type\":\"string\"},\"error\":{\"type\":[\"object\",\"null\"]},\"war"
-            "nings\":{\"type\":\"array\",\"items\":{\"type\":\"string\"}},\"revision\":{\"type\":"
-            "\"integer\",\"minimum\":0,\"description\":\"changes of the configuration so far\"},"
-            "\"changes\":{\"type\":\"array\",\"maxItems\":32,\"description\":\"the newest of them\","
-            "\"items\":{\"$ref\":\"#/components/schemas/Change\"}},\"journal\":{\"type\":[\"object\","
-            "\"null\"]},\"recorders\":{\"type\":\"array\","
-            "\"items\":{\"$ref\":\"#/components/schemas/Recorder\"}},\"performance\":{\"type\""
-            ":\"object\",\"required\":[\"wall_s\",\"particle_steps_per_s\",\"bytes_per_particle\","
-            "\"threads\",\"phases\"],\"properties\":{\"threads\":{\"type\":[\"integer\",\"null\"],"
-            "\"minimum\":1},\"wall_s\":{\"type\":\"number\"},\"particle_steps_per_s\":"
-            "{\"$ref\":\"#/components/schemas/Number\"},\"bytes_per_particle\":{\"$ref\":\"#/compon"
-            "ents/schemas/Number\"},\"phases\":{\"type\":\"object\",\"additionalProperties\":{\"typ"
-            "e\":\"number\"}}}},\"balance\":{\"type\":\"object\",\"required\":[\"mass\",\"momentum"
-            "\",\"angular_momentum\",\"kinetic_energy\",\"strain_energy\",\"external_work\"],\"prop"
-            "erties\":{\"mass\":{\"$ref\":\"#/components/schemas/Number\"},\"momentum\":{\"$ref\":"
-            "\"#/components/schemas/Vector\"},\"angular_momentum\":{\"$ref\":\"#/components/schemas"
-            "/Vector\"},\"kinetic_energy\":{\"$ref\":\"#/components/schemas/Number\"},\"strain_ener"
-            "gy\":{\"$ref\":\"#/components/schemas/Number\"},\"external_work\":{\"$ref\":\"#/compon"
-            "ents/schemas/Number\"}}},\"probes\":{\"type\":\"object\"},\"accuracy\":{\"type\":\"arr"
-            "ay\",\"items\":{\"type\":\"object\",\"required\":[\"probe\",\"value\",\"reference\",\""
-            "relative_error\",\"source\"]}},\"effective_step\":{\"type\":\"integer\"},\"frame_seq\""
-            ":{\"type\":\"integer\"}}}"},
+    {"Run",
+     "{\"type\":\"object\",\"required\":[\"id\",\"state\",\"step\",\"time\",\"end_time\",\"p"
+     "rogress\",\"eta_s\",\"dt\",\"fbar\",\"particles\",\"scene\",\"created\",\"error\",\"wa"
+     "rnings\",\"revision\",\"changes\",\"performance\",\"balance\",\"probes\",\"accuracy\"],"
+     "\"properties\":{\"id\":{"
+     "\"type\":\"string\"},\"state\":{\"$ref\":\"#/components/schemas/State\"},\"step\":{\"t"
+     "ype\":\"integer\"},\"time\":{\"$ref\":\"#/components/schemas/Number\"},\"end_time\":{"
+     "\"$ref\":\"#/components/schemas/Number\"},\"progress\":{\"type\":\"number\",\"minimum"
+     "\":0,\"maximum\":1},\"eta_s\":{\"$ref\":\"#/components/schemas/Number\"},\"dt\":{\"$re"
+     "f\":\"#/components/schemas/Number\"},\"fbar\":{\"type\":\"boolean\"},\"fbar_scheme\":{"
+     "\"type\":\"string\"},\"particles\":{\"type\":\"integer\"},\"scene\":{\"type\":\"string"
+     "\"},\"created\":{\"type\":\"string\"},\"error\":{\"type\":[\"object\",\"null\"]},\"war"
+     "nings\":{\"type\":\"array\",\"items\":{\"type\":\"string\"}},\"revision\":{\"type\":"
+     "\"integer\",\"minimum\":0,\"description\":\"changes of the configuration so far\"},"
+     "\"changes\":{\"type\":\"array\",\"maxItems\":32,\"description\":\"the newest of them\","
+     "\"items\":{\"$ref\":\"#/components/schemas/Change\"}},\"journal\":{\"type\":[\"object\","
+     "\"null\"]},\"recorders\":{\"type\":\"array\","
+     "\"items\":{\"$ref\":\"#/components/schemas/Recorder\"}},\"performance\":{\"type\""
+     ":\"object\",\"required\":[\"wall_s\",\"particle_steps_per_s\",\"bytes_per_particle\","
+     "\"threads\",\"phases\"],\"properties\":{\"threads\":{\"type\":[\"integer\",\"null\"],"
+     "\"minimum\":1},\"wall_s\":{\"type\":\"number\"},\"particle_steps_per_s\":"
+     "{\"$ref\":\"#/components/schemas/Number\"},\"bytes_per_particle\":{\"$ref\":\"#/compon"
+     "ents/schemas/Number\"},\"phases\":{\"type\":\"object\",\"additionalProperties\":{\"typ"
+     "e\":\"number\"}}}},\"balance\":{\"type\":\"object\",\"required\":[\"mass\",\"momentum"
+     "\",\"angular_momentum\",\"kinetic_energy\",\"strain_energy\",\"external_work\"],\"prop"
+     "erties\":{\"mass\":{\"$ref\":\"#/components/schemas/Number\"},\"momentum\":{\"$ref\":"
+     "\"#/components/schemas/Vector\"},\"angular_momentum\":{\"$ref\":\"#/components/schemas"
+     "/Vector\"},\"kinetic_energy\":{\"$ref\":\"#/components/schemas/Number\"},\"strain_ener"
+     "gy\":{\"$ref\":\"#/components/schemas/Number\"},\"external_work\":{\"$ref\":\"#/compon"
+     "ents/schemas/Number\"}}},\"probes\":{\"type\":\"object\"},\"accuracy\":{\"type\":\"arr"
+     "ay\",\"items\":{\"type\":\"object\",\"required\":[\"probe\",\"value\",\"reference\",\""
+     "relative_error\",\"source\"]}},\"effective_step\":{\"type\":\"integer\"},\"frame_seq\""
+     ":{\"type\":\"integer\"}}}"},
     {"Change",
      "{\"type\":\"object\",\"required\":[\"revision\",\"step\",\"time\",\"patch\"],\"properties\":{"
      "\"revision\":{\"type\":\"integer\",\"minimum\":1},\"step\":{\"type\":\"integer\"},\"time\":{"
@@ -130,17 +122,9 @@ static const struct {
     {"Runs",
      "{\"type\":\"object\",\"required\":[\"runs\"],\"properties\":{\"older\":{\"type\":\"integer"
      "\"},\"runs\":{\"type\":\"array\",\"items\":{\"$ref\":\"#/components/schemas/Run\"}}}}"},
-    {"Step",
-     "{\"type\":\"object\",\"additionalProperties\":false,\"minProperties\":1,\"maxPropertie"
-     "s\":1,\"properties\":{\"steps\":{\"type\":\"integer\",\"minimum\":1},\"until\":{\"type"
-     "\":\"number\"}}}"},
-    {"Empty", "{\"type\":\"object\",\"additionalProperties\":false}"},
     {"Config",
      "{\"type\":\"object\",\"properties\":{\"fbar\":{},\"damping\":{},\"transfer\":{},\"time"
      "\":{},\"gravity\":{},\"output\":{},\"effective_step\":{\"type\":\"integer\"}}}"},
-    {"Patch",
-     "{\"type\":\"object\",\"description\":\"merge patch of fbar, damping, transfer.blend, t"
-     "ime.dt or time.cfl, time.end, output, gravity\"}"},
     {"Scene",
      "{\"type\":\"object\",\"required\":[\"format\"],\"description\":\"see /v1/schemas/scene"
      ".json\"}"},
@@ -148,10 +132,6 @@ static const struct {
      "{\"type\":\"object\",\"required\":[\"step\",\"time\",\"probes\"],\"properties\":{\"ste"
      "p\":{\"type\":\"array\",\"items\":{\"type\":\"integer\"}},\"time\":{\"type\":\"array\""
      ",\"items\":{\"type\":\"number\"}},\"probes\":{\"type\":\"object\"}}}"},
-    {"Acknowledge",
-     "{\"type\":\"object\",\"required\":[\"acked\"],\"additionalProperties\":false,"
-     "\"properties\":{\"acked\":{\"type\":\"integer\",\"minimum\":-1,\"description\":\"number "
-     "of the last frame that is safe, with all before it; -1: none yet\"}}}"},
     {"Recorder",
      "{\"type\":\"object\",\"required\":[\"name\",\"acked\",\"lag_frames\",\"lag_bytes\"],"
      "\"properties\":{\"name\":{\"type\":\"string\"},\"acked\":{\"type\":\"integer\",\"minimum\""
@@ -291,6 +271,8 @@ cJSON *openapi_document(void) {
     for (size_t k = 0; k < sizeof schemas / sizeof *schemas; k++)
         cJSON_AddItemToObject(list, schemas[k].name,
                               json_parse(schemas[k].json, strlen(schemas[k].json), &faults));
+    for (size_t k = 0; bodies_name(k) != NULL; k++)
+        cJSON_AddItemToObject(list, bodies_name(k), bodies_schema(k));
     faults_free(&faults);
     cJSON *schemes = cJSON_AddObjectToObject(components, "securitySchemes");
     cJSON *token = cJSON_AddObjectToObject(schemes, "token");

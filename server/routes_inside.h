@@ -64,13 +64,12 @@ bool routes_thinning(struct call *c, struct thin *out);
 // A whole number of the query, 0 or more, `absent` when it is not there; false when the reply is a
 // 400.
 bool routes_query_number(struct call *c, const char *key, uint64_t absent, uint64_t *out);
-// A fault for every key of `body` that is not in `known` ("one two").
-void routes_unknown_keys(const cJSON *body, const char *known, struct faults *faults);
 // "must be EXPECTED, got ..." of a member of the body.
 void routes_value_fault(struct faults *faults, const char *key, const char *code,
                         const char *expected, const cJSON *value);
 const char *routes_type_name(const cJSON *item);
-// {"scene": name or object, "overrides": object}: the merged scene, new; NULL with faults.
+// {"scene": name or object, "overrides": object}, checked by bodies_check: the merged scene, new;
+// NULL with faults.
 cJSON *routes_merged_scene(const cJSON *body, struct faults *faults);
 // A scene that is valid and fits in memory; NULL with faults, whose pointers begin with `prefix`.
 struct scene *routes_checked_scene(const struct call *c, const cJSON *json, const char *prefix,

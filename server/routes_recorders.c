@@ -4,6 +4,7 @@
 #include <stdio.h>
 #include <string.h>
 
+#include "server/bodies.h"
 #include "server/routes_inside.h"
 
 static cJSON *recorder_json(struct journal *journal, const struct recorder *recorder) {
@@ -64,21 +65,11 @@ void routes_serve_recorders(struct call *c) {
 }
 
 static void check_body(const struct call *c, struct faults *faults) {
-    const cJSON *acked = json_member(c->body, "acked");
-    const char *expected = "a whole number, -1 (nothing yet) or more";
-    routes_unknown_keys(c->body, "acked", faults);
+    bodies_check(c->route->request, c->body, faults);
     if (!runs_id_valid(c->names[1]))
         faults_add(faults, "", "pattern", "[A-Za-z0-9][A-Za-z0-9._-]{0,63}", c->names[1],
                    "the recorder's name must match [A-Za-z0-9][A-Za-z0-9._-]{0,63}, got %.80s",
                    c->names[1]);
-    if (acked == NULL)
-        faults_add(faults, "/acked", "required", expected, NULL,
-                   "is required: the number of the last frame that is safe, -1 for none");
-    else if (!cJSON_IsNumber(acked))
-        routes_value_fault(faults, "acked", "type", expected, acked);
-    else if (acked->valuedouble < -1 || acked->valuedouble != floor(acked->valuedouble) ||
-             acked->valuedouble > 9007199254740992.0) // 2^53: where doubles cease to count
-        routes_value_fault(faults, "acked", "range", expected, acked);
 }
 
 static void put(struct call *c, struct run *run) {

@@ -5,6 +5,7 @@
 #include <stdlib.h>
 #include <string.h>
 
+#include "server/bodies.h"
 #include "server/history.h"
 #include "server/routes_inside.h"
 #include "server/scene_fault.h"
@@ -282,51 +283,18 @@ void routes_serve_delete(struct call *c) {
 
 // ---- Creating ---------------------------------------------------------------------------------
 
-static void check_recorders(const cJSON *list, struct run_definition *out, struct faults *faults) {
-    const cJSON *item;
-    char expected[96];
-    if (list == NULL)
+// What the body says of the run, as far as it is sound.
+static void read_create(const cJSON *body, struct run_definition *out, struct faults *faults) {
+    const size_t before = faults->count;
+    bodies_check("Create", body, faults);
+    if (faults->count != before)
         return;
-    snprintf(expected, sizeof expected, "at most %d names [A-Za-z0-9][A-Za-z0-9._-]{0,63}",
-             RECORDERS_MAX);
-    if (!cJSON_IsArray(list)) {
-        routes_value_fault(faults, "recorders", "type", "an array", list);
-        return;
-    }
-    cJSON_ArrayForEach(item, list) {
-        if (!cJSON_IsString(item) || !runs_id_valid(item->valuestring) ||
-            out->n_recorders == RECORDERS_MAX) {
-            routes_value_fault(faults, "recorders", "pattern", expected, list);
-            return;
-        }
-        out->recorders[out->n_recorders++] = item->valuestring;
-    }
-}
-
-static void check_create(const cJSON *body, struct run_definition *out, struct faults *faults) {
-    const cJSON *id = json_member(body, "id"), *start = json_member(body, "start");
-    const cJSON *wait = json_member(body, "wait_subscribers");
-    routes_unknown_keys(body, "scene overrides id start wait_subscribers recorders", faults);
-    if (id != NULL && !cJSON_IsString(id))
-        faults_add(faults, "/id", "type", "string", routes_type_name(id), "must be a string");
-    else if (id != NULL && !runs_id_valid(id->valuestring))
-        routes_value_fault(faults, "id", "pattern", "[A-Za-z0-9][A-Za-z0-9._-]{0,63}", id);
-    else if (id != NULL)
-        out->id = id->valuestring;
-    if (start != NULL && !cJSON_IsBool(start))
-        faults_add(faults, "/start", "type", "boolean", routes_type_name(start),
-                   "must be true or false");
-    out->start = start == NULL || cJSON_IsTrue(start);
-    check_recorders(json_member(body, "recorders"), out, faults);
-    if (wait == NULL)
-        return;
-    if (!cJSON_IsNumber(wait) || wait->valuedouble < 0 ||
-        wait->valuedouble != floor(wait->valuedouble))
-        routes_value_fault(faults, "wait_subscribers", "type", "a whole number, 0 or more", wait);
-    else if (wait->valuedouble > RUN_SUBSCRIBERS_MAX)
-        routes_value_fault(faults, "wait_subscribers", "range", "at most 10000", wait);
-    else
-        out->wait_subscribers = (uint64_t)wait->valuedouble;
+    const cJSON *wait = json_member(body, "wait_subscribers"), *item;
+    out->id = cJSON_GetStringValue(json_member(body, "id"));
+    out->start = !cJSON_IsFalse(json_member(body, "start"));
+    out->wait_subscribers = wait != NULL ? (uint64_t)wait->valuedouble : 0;
+    cJSON_ArrayForEach(item, json_member(body, "recorders")) out->recorders[out->n_recorders++] =
+        item->valuestring;
 }
 
 // The key of a request that may be sent twice, and a digest of its body. False when the reply is a
@@ -367,7 +335,7 @@ void routes_serve_create(struct call *c) {
     char why[JOURNAL_WHY] = "", digest[JSON_DIGEST];
     if (!idempotency(c, &definition, digest))
         return;
-    check_create(c->body, &definition, &faults);
+    read_create(c->body, &definition, &faults);
     cJSON *merged = routes_merged_scene(c->body, &faults);
     struct scene *scene =
         merged != NULL ? routes_checked_scene(c, merged, "/scene", &estimate, &faults) : NULL;
@@ -414,26 +382,6 @@ done:
 
 // ---- Actions ----------------------------------------------------------------------------------
 
-static bool step_body(const cJSON *body, struct run_command *command, struct faults *faults) {
-    const cJSON *steps = json_member(body, "steps"), *until = json_member(body, "until");
-    routes_unknown_keys(body, "steps until", faults);
-    if ((steps != NULL) == (until != NULL))
-        faults_add(faults, "", steps == NULL ? "required" : "conflict", "steps or until", NULL,
-                   "must have one of steps and until");
-    if (steps != NULL && (!cJSON_IsNumber(steps) || steps->valuedouble < 1 ||
-                          steps->valuedouble != floor(steps->valuedouble)))
-        routes_value_fault(faults, "steps", cJSON_IsNumber(steps) ? "range" : "type",
-                           "a whole number, 1 or more", steps);
-    if (until != NULL && !cJSON_IsNumber(until))
-        routes_value_fault(faults, "until", "type", "a time in s", until);
-    if (faults->count > 0)
-        return false;
-    // 2^53: beyond that a double holds no whole numbers, and no run does as many steps
-    command->steps = steps != NULL ? (uint64_t)fmin(steps->valuedouble, 9007199254740992.0) : 0;
-    command->until = until != NULL ? until->valuedouble : NAN;
-    return true;
-}
-
 // The reply to a command that was not carried out.
 static void refuse(struct call *c, const struct run_command *command) {
     bool configures = command->action == RUN_DO_CONFIGURE;
@@ -471,10 +419,13 @@ void routes_serve_action(struct call *c) {
     struct run *run = routes_run_of(c);
     if (run == NULL)
         return;
-    if (command.action == RUN_DO_STEP)
-        step_body(c->body, &command, &faults);
-    else
-        routes_unknown_keys(c->body, "", &faults);
+    const cJSON *steps = json_member(c->body, "steps"), *until = json_member(c->body, "until");
+    bodies_check(c->route->request, c->body, &faults);
+    if (faults.count == 0) {
+        // 2^53: beyond that a double holds no whole numbers, and no run does as many steps
+        command.steps = steps != NULL ? (uint64_t)fmin(steps->valuedouble, 9007199254740992.0) : 0;
+        command.until = until != NULL ? until->valuedouble : NAN;
+    }
     if (faults.count > 0) {
         reply_faults(c->reply, 422, &faults);
     } else {

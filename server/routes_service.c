@@ -2,6 +2,7 @@
 #include <stdio.h>
 #include <string.h>
 
+#include "server/bodies.h"
 #include "server/openapi.h"
 #include "server/routes_inside.h"
 #include "server/scene_fault.h"
@@ -109,33 +110,6 @@ void routes_value_fault(struct faults *faults, const char *key, const char *code
     scene_value_fault(faults, &at, code, expected, value);
 }
 
-void routes_unknown_keys(const cJSON *body, const char *known, struct faults *faults) {
-    char words[128], expected[160], *names[8];
-    size_t n = 0;
-    snprintf(words, sizeof words, "%s", known);
-    for (char *rest = words, *word; (word = strsep(&rest, " ")) != NULL;)
-        if (word[0] != '\0' && n < sizeof names / sizeof *names)
-            names[n++] = word;
-    snprintf(expected, sizeof expected, "%s", n == 0 ? "no keys" : "one of");
-    for (size_t k = 0; k < n; k++) {
-        size_t length = strlen(expected);
-        snprintf(expected + length, sizeof expected - length, "%s%s", k == 0 ? " " : ", ",
-                 names[k]);
-    }
-    const cJSON *item;
-    cJSON_ArrayForEach(item, body) {
-        struct scene_cursor root = {0}, at = {.parent = &root, .key = item->string};
-        struct scene_suggestion s = {.word = item->string};
-        bool is_known = false;
-        for (size_t k = 0; k < n; k++) {
-            is_known = is_known || strcmp(names[k], item->string) == 0;
-            scene_suggest(&s, names[k]);
-        }
-        if (!is_known)
-            scene_unknown_fault(faults, &at, "unknown_key", expected, "there is no key", &s);
-    }
-}
-
 // What was perhaps meant by the name of a scene that there is not: a near word, or else the first
 // name that holds it ("footing").
 static const char *nearest_scene(const char *name) {
@@ -180,25 +154,18 @@ static cJSON *builtin_named(const char *name, struct faults *faults) {
     return NULL;
 }
 
-// {"scene": name or object, "overrides": object}: the merged scene, new; NULL with faults.
+// {"scene": name or object, "overrides": object}, checked by bodies_check: the merged scene, new;
+// NULL with faults.
 cJSON *routes_merged_scene(const cJSON *body, struct faults *faults) {
     const cJSON *given = json_member(body, "scene"), *overrides = json_member(body, "overrides");
     cJSON *scene = NULL;
-    if (given == NULL)
-        faults_add(faults, "/scene", "required", "a built-in scene's name, or a scene", NULL,
-                   "is missing");
-    else if (cJSON_IsString(given))
+    if (cJSON_IsString(given))
         scene = builtin_named(given->valuestring, faults);
     else if (cJSON_IsObject(given))
         scene = cJSON_Duplicate(given, true);
-    else
-        faults_add(faults, "/scene", "type", "string or object", routes_type_name(given),
-                   "must be a built-in scene's name, or a scene");
     if (overrides == NULL)
         return scene;
-    if (!cJSON_IsObject(overrides)) {
-        faults_add(faults, "/overrides", "type", "object", routes_type_name(overrides),
-                   "must be a merge patch on the scene: an object");
+    if (!cJSON_IsObject(overrides)) { // what bodies_check has found
         cJSON_Delete(scene);
         return NULL;
     }
@@ -249,7 +216,7 @@ void routes_serve_validate(struct call *c) {
     bool bare = json_member(c->body, "scene") == NULL;
     cJSON *merged = NULL;
     if (!bare) {
-        routes_unknown_keys(c->body, "scene overrides", &faults);
+        bodies_check(c->route->request, c->body, &faults);
         merged = routes_merged_scene(c->body, &faults);
     }
     struct scene *scene = NULL;

@@ -59,6 +59,8 @@ cJSON *scene_config_patch(const cJSON *scene_as_run, const cJSON *patch, struct 
 
 // JSON Schema 2020-12 of a scene; new.
 cJSON *scene_schema(void);
+// The same of a merge patch of what may change while a run goes on, new.
+cJSON *scene_patch_schema(void);
 // The tables of keys in docs/scene.md, Markdown; freed with free. A unit test compares the two.
 char *scene_reference_markdown(void);
 // GET /v1/materials: {"materials": [{name, description, parameters: [...]}]}; new.

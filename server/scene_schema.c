@@ -157,8 +157,9 @@ static cJSON *material_schema(void) {
     return schema;
 }
 
-// What a stage may change of a material: which of these parameters it has depends on its model, which
-// stands elsewhere. A name that several models have means the same in all of them, bounds included.
+// What a stage may change of a material: which of these parameters it has depends on its model,
+// which stands elsewhere. A name that several models have means the same in all of them, bounds
+// included.
 static cJSON *material_patch_schema(void) {
     cJSON *schema = cJSON_CreateObject();
     put_text(schema, "type", "object");
@@ -311,6 +312,52 @@ cJSON *scene_schema(void) {
     add_definitions(definitions, &scene_root);
     cJSON_AddItemToObject(full, "$defs", definitions);
     return full;
+}
+
+static cJSON *patch_of_keys(const struct scene_key *keys, bool live);
+
+// What a merge patch may put in the place of the value, or null: back to the default.
+static cJSON *patch_of_value(const struct scene_value *value) {
+    cJSON *schema = cJSON_CreateObject(), *forms = cJSON_AddArrayToObject(schema, "anyOf");
+    const bool either = value->type == SCENE_EITHER;
+    const size_t n = either ? value->n_items : 1;
+    const struct scene_value *items = either ? value->items : value;
+    for (size_t i = 0; i < n; i++)
+        cJSON_AddItemToArray(forms, items[i].type == SCENE_OBJECT
+                                        ? patch_of_keys(items[i].keys, true)
+                                        : value_schema(&items[i]));
+    cJSON *null = cJSON_CreateObject();
+    put_text(null, "type", "null");
+    cJSON_AddItemToArray(forms, null);
+    return schema;
+}
+
+// A patch of an object: any of the keys that may change. `live`: all of them may.
+static cJSON *patch_of_keys(const struct scene_key *keys, bool live) {
+    cJSON *schema = cJSON_CreateObject();
+    put_text(schema, "type", "object");
+    cJSON *properties = cJSON_AddObjectToObject(schema, "properties");
+    for (const struct scene_key *key = keys; key->name; key++) {
+        cJSON *property = NULL;
+        if (live || key->live) {
+            property = patch_of_value(&key->value);
+            put_text(property, "description", key->doc);
+        } else if (key->value.type == SCENE_OBJECT) {
+            property = patch_of_keys(key->value.keys, false);
+            if (!json_member(property, "properties")->child) {
+                cJSON_Delete(property);
+                continue;
+            }
+        }
+        if (property)
+            cJSON_AddItemToObject(properties, key->name, property);
+    }
+    cJSON_AddFalseToObject(schema, "additionalProperties");
+    return schema;
+}
+
+cJSON *scene_patch_schema(void) {
+    return patch_of_keys(scene_root.keys, false);
 }
 
 cJSON *scene_materials_json(void) {

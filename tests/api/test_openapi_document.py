@@ -142,6 +142,56 @@ def test_socket_is_closed_after_an_idle_connection_asks_nothing(daemon):
             assert s.recv(65536).startswith(b"HTTP/1.1 200")
 
 
+JUNK = [None, True, False, -1, 0, 1, 1.5, 2**60, "", "a", "with a blank", "x" * 64, "x" * 65, [], ["a"], ["a", "b c"], ["a"] * 65, [1], {}, {"a": 1}]
+
+
+def bodies(keys):
+    """Each key with each junk value, alone and beside the other keys; and a key that there is not."""
+    yield {}
+    yield {"nothing_of_the_kind": 1}
+    for key in keys:
+        for value in JUNK:
+            yield {key: value}
+            yield {**keys, key: value}
+
+
+def says(document, path, method):
+    """What the document says of a body: a function that tells whether it is valid."""
+    schema = document["paths"][path][method]["requestBody"]["content"]["application/json"]["schema"]
+    return jsonschema.Draft202012Validator({**schema, "components": document["components"]}).is_valid
+
+
+@pytest.mark.parametrize("path, method, keys, exact", [
+    ("/v1/runs/{id}:step", "post", {"steps": 1}, True),
+    ("/v1/runs/{id}:step", "post", {"until": 1.0}, True),
+    ("/v1/runs/{id}:pause", "post", {}, True),
+    ("/v1/runs/{id}/recorders/{name}", "put", {"acked": -1}, False),  # a number beyond the frames there are is refused too
+    ("/v1/runs/{id}/config", "patch", {"fbar": True, "damping": {"local": 0.1}, "output": {"every_steps": 5}, "gravity": [0, -1],
+                                       "time": {"end": 1}, "transfer": {"blend": 1}}, False),
+    ("/v1/runs", "post", {"scene": "dam-break", "overrides": {}, "id": "a-name", "start": False, "wait_subscribers": 3,
+                          "recorders": ["a"]}, False),
+    ("/v1/scenes:validate", "post", {"scene": "dam-break", "overrides": {}}, False),
+])  # fmt: skip
+def test_bodies_are_refused_where_the_document_says(daemon, document, path, method, keys, exact):
+    """What it does not allow is a 422, and what it allows is none where the schema says all that there is to say."""
+    run = daemon.create(water(), start=False)["id"]
+    if exact:
+        daemon.act(run, "cancel")  # then what is sound is a 409
+    valid = says(document, path, method)
+    url, refused = path.replace("{id}", run).replace("{name}", "somebody"), 0
+    for body in bodies(keys):
+        if path == "/v1/runs" and valid(body):
+            continue  # other tests create runs
+        status = daemon.request(method.upper(), url, body).status
+        if valid(body):
+            assert (status in (200, 409)) if exact else status in (200, 409, 422), (body, status)
+        else:
+            assert status == 422, (body, status)
+            refused += 1
+    assert refused > 0
+    daemon.away(run)
+
+
 # ---- Keep this last: it needs the answers to all other tests. ----
 
 
