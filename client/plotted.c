@@ -18,6 +18,7 @@ static const struct {
     const char *name, *text;
 } labels[] = {
     {"mean_stress", "mean normal stress"},
+    {"mean_stress_smooth", "mean normal stress, smooth"},
     {"volume_ratio", "volume ratio J"},
     {"volume_ratio_bar", "volume ratio of the stress"},
     {"von_mises", "von Mises stress"},

@@ -31,6 +31,7 @@ static const struct {
     {"velocity", "m/s", "velocity"},
     {"displacement", "m", "current less reference position"},
     {"mean_stress", "Pa", "mean normal stress tr(sigma)/3 with sigma33, tension positive"},
+    {"mean_stress_smooth", "Pa", "mean stress averaged over the grid once, for showing"},
     {"stress", "Pa",
      "Cauchy stress, row by row, tension positive (2D: in-plane components, the rest 0)"},
     {"von_mises", "Pa", "von Mises equivalent stress"},

@@ -70,6 +70,8 @@ int scene_table_column(const struct scene_table *table, const char *name) {
 bool scene_table_field(const struct scene_table *table, enum mpm_field field, int component,
                        int dimension, int *columns, char lacks[40]) {
     const char *part;
+    if (field == MPM_FIELD_MEAN_STRESS_SMOOTH) // what it should be is the mean stress
+        field = MPM_FIELD_MEAN_STRESS;
     for (int c = 0; (part = scene_field_component(field, dimension, c)); c++) {
         if (component >= 0 && c != component)
             continue;

@@ -88,6 +88,9 @@ void mpm_particle_field(const struct mpm_particles *s, size_t p, enum mpm_field 
     case MPM_FIELD_MEAN_STRESS:
         out[0] = mpm_mean_stress(s, p);
         break;
+    case MPM_FIELD_MEAN_STRESS_SMOOTH:
+        out[0] = s->smooth ? s->smooth[mpm_particle_id(s, p)] : NAN;
+        break;
     case MPM_FIELD_STRESS:
         for (int i = 0; i < dim; i++) {
             for (int j = 0; j < dim; j++) {
@@ -125,6 +128,9 @@ void mpm_particle_field(const struct mpm_particles *s, size_t p, enum mpm_field 
 void mpm_field_copy(const struct mpm_sim *sim, enum mpm_field field, void *out) {
     const size_t width = mpm_field_components(field, sim->grid.dim);
     const bool is_u4 = strcmp(infos[field].dtype, "<u4") == 0;
+    if (field == MPM_FIELD_MEAN_STRESS_SMOOTH) {
+        mpm_smooth_update(sim);
+    }
     for (size_t b = 0; b < sim->n_sets; b++) {
         const struct mpm_particles *s = &sim->sets[b];
         for (size_t p = 0; p < s->n; p++) {

@@ -186,6 +186,10 @@ static void particle_field(const struct mpm_sim *sim, size_t probe, enum mpm_fie
 static void present_value(struct mpm_sim *sim, size_t probe, double *out) {
     const struct mpm_probe_def *q = &sim->def->probes[probe];
     struct mpm_balance balance;
+    if ((takes_field(q->kind) || q->kind == MPM_PROBE_ERROR) &&
+        q->field == MPM_FIELD_MEAN_STRESS_SMOOTH) {
+        mpm_smooth_update(sim);
+    }
     switch (q->kind) {
     case MPM_PROBE_EXTENT:
         out[0] = extent(sim, q);

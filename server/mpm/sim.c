@@ -437,11 +437,12 @@ enum mpm_status mpm_create(const struct mpm_def *def, struct mpm_sim **out, stru
     sim->walls = calloc(def->n_walls + 1, sizeof *sim->walls);
     sim->loads = calloc(def->n_loads + 1, sizeof *sim->loads);
     sim->rigids = calloc(def->n_rigids + 1, sizeof *sim->rigids);
+    sim->smooth = calloc(1, sizeof *sim->smooth);
     for (int d = 0; d < MPM_MAX_DIM; d++) {
         sim->c.min[d] = INFINITY;
         sim->c.max[d] = -INFINITY;
     }
-    if (!sim->sets || !sim->orders || !sim->walls || !sim->loads || !sim->rigids ||
+    if (!sim->sets || !sim->orders || !sim->walls || !sim->loads || !sim->rigids || !sim->smooth ||
         !mpm_grid_create(&sim->grid, def, mpm_support(def->basis)) || !create_sets(sim)) {
         goto fail;
     }
@@ -518,6 +519,7 @@ void mpm_free(struct mpm_sim *sim) {
         mpm_order_free(&sim->orders[b]);
     }
     mpm_sorter_free(&sim->sorter);
+    mpm_smooth_free(sim->smooth);
     free(sim->team);
     free(sim->turns);
     for (size_t k = 0; sim->walls && k < sim->n_walls; k++) {
@@ -650,7 +652,8 @@ size_t mpm_n_nodes(const struct mpm_sim *sim) {
 }
 
 size_t mpm_bytes(const struct mpm_sim *sim) {
-    size_t bytes = sim->grid.bytes + sim->sorter.bytes;
+    size_t bytes = sim->grid.bytes + sim->sorter.bytes + mpm_smooth_bytes(sim->smooth) +
+                   (sim->smooth->value ? sim->n_particles * sizeof(double) : 0);
     for (size_t b = 0; b < sim->n_sets; b++) {
         bytes += sim->sets[b].memory_bytes + sim->sets[b].fbar_bytes;
     }

@@ -9,6 +9,7 @@
 #include "server/mpm/fbar.h"
 #include "server/mpm/load.h"
 #include "server/mpm/order.h"
+#include "server/mpm/smooth.h"
 #include "server/mpm/transfer.h"
 
 #define MPM_CHUNK 256 // particles of work that is not by tiles; never depends on the thread count
@@ -73,6 +74,7 @@ struct mpm_sim {
     struct mpm_compare *compares;       // (n_probes)
     struct mpm_body_force *body_forces; // (n_sets), NULL without a body force
     double *scratch;                    // (n_particles), where a probe sorts
+    struct mpm_smooth *smooth;          // owned
     struct mpm_clockwork c;
     double phase_seconds[MPM_N_PHASES];
 };
@@ -107,7 +109,8 @@ bool mpm_sort(struct mpm_sim *sim);
 bool mpm_restore_order(struct mpm_sim *sim);
 // Takes the memory that a scheme needs; what is taken stays. False when memory is short.
 bool mpm_provide_fbar(struct mpm_sim *sim, enum mpm_fbar_scheme scheme);
-// One field at one particle, as doubles (components).
+// One field at one particle, as doubles (components); mean_stress_smooth as mpm_smooth_update has
+// left it.
 void mpm_particle_field(const struct mpm_particles *s, size_t p, enum mpm_field field, double *out);
 // The medium that an error probe's solution is for: that of its body in the last stage.
 struct mpm_medium mpm_probe_medium(const struct mpm_def *def, const struct mpm_probe_def *q);

@@ -75,6 +75,7 @@ bool mpm_solution_tells(enum mpm_solution_kind kind, enum mpm_field field) {
         return kind != MPM_SOLUTION_TAYLOR_GREEN && kind != MPM_SOLUTION_TUBE &&
                kind != MPM_SOLUTION_RITTER;
     case MPM_FIELD_MEAN_STRESS:
+    case MPM_FIELD_MEAN_STRESS_SMOOTH:
         return kind != MPM_SOLUTION_TUBE && kind != MPM_SOLUTION_RITTER;
     default:
         return false;

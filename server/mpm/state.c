@@ -117,6 +117,7 @@ enum mpm_status mpm_state_load(struct mpm_sim *sim, const void *in, size_t bytes
                         bytes, (unsigned long long)theirs.n_particles,
                         (unsigned long long)mine.n_particles);
     }
+    sim->smooth->step = 0;
     mpm_restore_stage(sim);
     if (!mpm_provide_fbar(sim, sim->c.now.fbar.scheme)) {
         return mpm_fail(err, MPM_ERR_MEMORY, "/fbar", "no memory for what F-bar needs");

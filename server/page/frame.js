@@ -56,12 +56,13 @@ export function positions(frame) {
   return out;
 }
 
-const SIGNED = new Set(["mean_stress", "stress"]);
+const SIGNED = new Set(["mean_stress", "mean_stress_smooth", "stress"]);
 const NAMES = {
   position: "Position",
   velocity: "Velocity",
   displacement: "Displacement",
   mean_stress: "Mean stress",
+  mean_stress_smooth: "Mean stress, smooth",
   stress: "Stress",
   von_mises: "Von Mises stress",
   volume_ratio: "Volume ratio J",

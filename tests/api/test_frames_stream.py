@@ -12,7 +12,7 @@ from frames import Frame
 
 ALL_FIELDS = {
     "position": ("m", "<f8", 2), "velocity": ("m/s", "<f8", 2), "displacement": ("m", "<f8", 2),
-    "mean_stress": ("Pa", "<f8", 1), "stress": ("Pa", "<f8", 3), "von_mises": ("Pa", "<f8", 1),
+    "mean_stress": ("Pa", "<f8", 1), "mean_stress_smooth": ("Pa", "<f8", 1), "stress": ("Pa", "<f8", 3), "von_mises": ("Pa", "<f8", 1),
     "volume_ratio": ("1", "<f8", 1), "volume_ratio_bar": ("1", "<f8", 1), "density": ("kg/m^3", "<f8", 1),
     "body": ("1", "<u4", 1), "id": ("1", "<u4", 1),
 }  # fmt: skip

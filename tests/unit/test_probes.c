@@ -645,6 +645,99 @@ static void test_fields_have_their_values(void **state) {
     }
 }
 
+// The weights of docs/method.md, section 5, as functions of the distance from the node in cells.
+static double hat_of(enum mpm_basis basis, double r) {
+    const double l = 0.25; // uGIMP: half a particle, two in each direction
+    r = fabs(r);
+    switch (basis) {
+    case MPM_LINEAR:
+        return fmax(0, 1 - r);
+    case MPM_GIMP:
+        return r < l       ? 1 - (r * r + l * l) / (2 * l)
+               : r < 1 - l ? 1 - r
+               : r < 1 + l ? (1 + l - r) * (1 + l - r) / (4 * l)
+                           : 0;
+    case MPM_BSPLINE2:
+        return r < 0.5 ? 0.75 - r * r : r < 1.5 ? 0.5 * (1.5 - r) * (1.5 - r) : 0;
+    default:
+        return r < 1 ? 2.0 / 3 - r * r + 0.5 * r * r * r : r < 2 ? pow(2 - r, 3) / 6 : 0;
+    }
+}
+
+static double weight_of(const struct mpm_sim *sim, const struct mpm_particles *s, size_t p,
+                        const int *node) {
+    double w = 1;
+    for (int d = 0; d < s->dim; d++) {
+        w *= hat_of(sim->def->basis,
+                    (s->x[mpm_at(p, s->dim, d)] - sim->grid.origin[d]) * sim->grid.inv_h - node[d]);
+    }
+    return w;
+}
+
+// The average by its formula, from all particles of a body at every node around one of them.
+static double smooth_of(const struct mpm_sim *sim, const struct mpm_particles *s, size_t p) {
+    double sum = 0;
+    int base[3] = {0}, node[3] = {0};
+    for (int d = 0; d < s->dim; d++) {
+        base[d] =
+            (int)floor((s->x[mpm_at(p, s->dim, d)] - sim->grid.origin[d]) * sim->grid.inv_h) - 2;
+    }
+    for (int k = 0; k < (s->dim == 3 ? 216 : 36); k++) {
+        double V = 0, V_p = 0;
+        node[0] = base[0] + k % 6, node[1] = base[1] + k / 6 % 6, node[2] = base[2] + k / 36;
+        const double w = weight_of(sim, s, p, node);
+        for (size_t q = 0; w > 0 && q < s->n; q++) {
+            V += weight_of(sim, s, q, node) * s->V[q];
+            V_p += weight_of(sim, s, q, node) * s->V[q] * mpm_mean_stress(s, q);
+        }
+        sum += w > 0 ? w * V_p / V : 0;
+    }
+    return sum;
+}
+
+static void test_smooth_mean_stress_is_the_average_over_the_grid(void **state) {
+    (void)state;
+    for (int dim = 2; dim <= 3; dim++) {
+        for (int basis = 0; basis < MPM_N_BASES; basis++) {
+            define(dim);
+            world.def.basis = (enum mpm_basis)basis;
+            struct mpm_probe_def *q = add_probe(MPM_PROBE_MAXIMUM, 1);
+            q->field = MPM_FIELD_MEAN_STRESS_SMOOTH;
+            struct mpm_sim *sim = create();
+            assert_int_equal(mpm_smooth_bytes(sim->smooth), 0); // nobody has asked yet
+            struct mpm_particles *s = &sim->sets[0];
+            uint32_t random = 7;
+            for (size_t p = 0; p < s->n; p++) { // scattered, one of them far out, and unequal
+                for (int d = 0; d < dim; d++) {
+                    random = random * 1664525u + 1013904223u;
+                    s->x[mpm_at(p, dim, d)] = p == 5 ? 2.7 : 0.5 * random / 4294967296.0;
+                }
+                random = random * 1664525u + 1013904223u;
+                s->V[p] *= 0.5 + random / 4294967296.0;
+                for (int k = 0; k < 3; k++) {
+                    s->sigma[mpm_at(p, MPM_SYM(dim), k)] = 1000 * sin((double)p);
+                }
+            }
+            for (size_t p = 0; p < sim->sets[1].n; p++) { // a body of its own, with one stress
+                for (int k = 0; k < 3; k++) {
+                    sim->sets[1].sigma[mpm_at(p, MPM_SYM(dim), k)] = -200;
+                }
+            }
+            double *out = calloc(sim->n_particles, sizeof *out);
+            mpm_field_copy(sim, MPM_FIELD_MEAN_STRESS_SMOOTH, out);
+            for (size_t p = 0; p < s->n; p++) {
+                assert_near(out[mpm_particle_id(s, p)], smooth_of(sim, s, p), 1e-10); // of 1000
+            }
+            for (size_t k = s->n; k < sim->n_particles; k++) {
+                assert_near(out[k], -200, 1e-11); // weights sum to 1
+            }
+            assert_near(value(sim, 0), -200, 1e-11);
+            free(out);
+            mpm_free(sim);
+        }
+    }
+}
+
 int main(int argc, char **argv) {
     feenableexcept(FE_DIVBYZERO | FE_INVALID | FE_OVERFLOW);
     const struct CMUnitTest tests[] = {
@@ -664,6 +757,7 @@ int main(int argc, char **argv) {
         cmocka_unit_test(test_probe_average_survives_a_jump_of_the_clock),
         cmocka_unit_test(test_fields_describe_themselves),
         cmocka_unit_test(test_fields_have_their_values),
+        cmocka_unit_test(test_smooth_mean_stress_is_the_average_over_the_grid),
     };
     cmocka_set_test_filter(argc > 1 ? argv[1] : NULL);
     return cmocka_run_group_tests(tests, NULL, NULL);
