@@ -9,6 +9,7 @@ the machine changes little, and particle-steps, which it does not change at all.
 Writes accuracy.csv and pareto.csv (for each problem and measure the runs that nothing beats in both error and cost).
 --case runs one point again and prints it; --list names them. What is done is kept; it goes on where it was stopped."""
 import argparse
+import csv
 import dataclasses
 import itertools
 import json
@@ -16,7 +17,7 @@ import math
 import pathlib
 import sys
 
-from study import BASES, ROOT, SCHEMES, Point, Store, at, composed, last, markdown, run, write_csv
+from study import BASES, ROOT, SCHEMES, Point, Store, at, composed, last, markdown, run, scene_path, series, write_csv
 
 DEFAULT = {"basis": "bspline2", "scheme": "anchored", "cfl": 0.3, "ppc": None, "blend": 1.0}
 FACTORS = {"cfl": (0.1, 0.5), "ppc": (4, 9, 16), "blend": (0.99, 0.9, 0.0)}
@@ -40,30 +41,62 @@ def footing(cell, n):
             "time": {"dt": None, "end": 1.3}, "bodies": {"soil": {"particles_per_cell": n * n}}}  # fmt: skip
 
 
+def measured_fronts():
+    """Times (s) and fronts (m) of Martin and Moyce after the water has begun to move."""
+    lines = (ROOT / "scenes" / "reference" / "dam_break_martin_moyce.csv").read_text().splitlines()
+    rows = csv.DictReader(line for line in lines if not line.startswith("#"))
+    return [(float(r["t"]), float(r["front"])) for r in rows if 0.03 < float(r["t"]) < 0.17]
+
+
+def front_error(result):
+    """RMS over the measured fronts of the relative difference, the computed front interpolated in time."""
+    computed = [(t, x) for t, x in series(result, "front") if t >= 0]
+
+    def front(time):
+        (t0, x0), (t1, x1) = next(pair for pair in itertools.pairwise(computed) if pair[1][0] >= time)
+        return x0 + (x1 - x0) * (time - t0) / (t1 - t0)
+
+    return math.sqrt(sum((front(t) / x - 1) ** 2 for t, x in MEASURED) / len(MEASURED))
+
+
+def pressure(r):
+    return last(r, "pressure_error")
+
+
+def smooth(r):
+    """Of the reported average, mean_stress_smooth."""
+    return last(r, "smooth_error")
+
+
+WIDTH = 0.05715  # m, of the column of water that was measured
+FINEST = 5.180  # m: front at 0.336 s with h = 1/32 m, the default method (uGIMP: 5.183)
+MEASURED = measured_fronts()
+
 PROBLEMS = [
     Problem("cook", "hard-incompressible", "membrane", (8, 4, 2, 1.6), {
-        "displacement": lambda r: abs(last(r, "column.y") / 0.261735 - 1),
-        "pressure": lambda r: last(r, "pressure_error")},
+        "displacement": lambda r: abs(last(r, "column.y") / 0.261735 - 1), "pressure": pressure, "pressure, smooth": smooth},
         lambda cell, n: {"materials": {"rubber": {"poisson_ratio": 0.499}}}, paper=(1, 0.5)),
     Problem("cylinder", "thick-cylinder", "ring", (0.5, 0.25, 0.1875, 0.125), {
-        "displacement": lambda r: last(r, "displacement_error"), "pressure": lambda r: last(r, "pressure_error")},
+        "displacement": lambda r: last(r, "displacement_error"), "pressure": pressure, "pressure, smooth": smooth},
         ppc=9, paper=(0.0625,)),
     Problem("taylor-green", "taylor-green", "vortex", (0.25, 0.125, 0.0625, 0.03125), {
-        "velocity": lambda r: last(r, "velocity_error"), "pressure": lambda r: last(r, "pressure_error")},
+        "velocity": lambda r: last(r, "velocity_error"), "pressure": pressure, "pressure, smooth": smooth},
         lambda cell, n: {"time": {"end": 0.5}, "references": []}, ppc=9, paper=(0.015625,)),
     Problem("vortex", "vortex", "ring", (0.25, 0.125, 0.08125, 0.0625), {
-        "displacement": lambda r: last(r, "displacement_error"), "stress": lambda r: last(r, "stress_error")},
+        "displacement": lambda r: last(r, "displacement_error"), "pressure": pressure, "pressure, smooth": smooth},
         lambda cell, n: {"time": {"end": 0.25}, "references": []}, ppc=16, paper=(0.03125,)),
-    Problem("vortex-0.499", "vortex-incompressible", "ring", (0.25, 0.125, 0.08125), {
-        "displacement": lambda r: last(r, "displacement_error"), "pressure": lambda r: last(r, "pressure_error")},
-        lambda cell, n: {"time": {"end": 0.25}, "references": []}, ppc=16, paper=(0.0625, 0.03125)),
+    Problem("vortex-0.499", "vortex-incompressible", "ring", (0.25, 0.125, 0.08125, 0.0625), {
+        "displacement": lambda r: last(r, "displacement_error"), "pressure": pressure, "pressure, smooth": smooth},
+        lambda cell, n: {"time": {"end": 0.25}, "references": []}, ppc=16, paper=(0.03125,)),
     Problem("column", "hydrostatic-column", "column", (0.5, 0.25, 0.125, 0.0625), {
-        "pressure": lambda r: last(r, "pressure_error")}, ppc=16),
+        "pressure": pressure, "pressure, smooth": smooth}, ppc=16),
     Problem("footing", "strip-footing-small", "soil", (0.25, 0.125, 0.1, 0.0625), {
         "load": lambda r: abs(last(r, "load.y") / (2 + math.pi) - 1)}, footing, paper=(0.05, 0.025)),
-    Problem("dam", "hard-dam-break", "reservoir", (0.5, 0.25, 0.125), {
-        "front": lambda r: abs(at(r, "front", 0.336) / 5.26 - 1)},  # m: extrapolated from h = 1/8 and 1/16 m
-        lambda cell, n: {"time": {"end": 0.672}}, samples=2, paper=(0.0625,)),
+    Problem("dam", "hard-dam-break", "reservoir", (0.5, 0.25, 0.125, 0.0625), {
+        "front": lambda r: abs(at(r, "front", 0.336) / FINEST - 1)},
+        lambda cell, n: {"time": {"end": 0.672}}, samples=2, paper=(0.03125,)),
+    Problem("dam-measured", "dam-break-column", "reservoir", (WIDTH / 2, WIDTH / 4, WIDTH / 8, WIDTH / 12), {
+        "fronts": front_error}, lambda cell, n: {"references": []}, ppc=16, samples=36, paper=(WIDTH / 16,)),
 ]  # fmt: skip
 
 
@@ -89,7 +122,10 @@ def points(size, only=()):
             patch = {"cell": cell, "basis": method["basis"], "fbar": SCHEMES[method["scheme"]],
                      "transfer": {"blend": method["blend"]}, "time": {"cfl": method["cfl"]},
                      "bodies": {problem.body: {"particles_per_cell": ppc}}}  # fmt: skip
-            labels = {"problem": problem.name, **method, "ppc": ppc, "cell": cell}
+            if smooth in problem.measures.values():
+                probe = json.loads(scene_path(problem.scene).read_text())["probes"]["pressure_error"]
+                patch["probes"] = {"smooth_error": {**probe, "field": "mean_stress_smooth"}}
+            labels = {"problem": problem.name, **method, "ppc": ppc, "cell": round(cell, 8)}
             name = "-".join(str(v) for v in labels.values())
             yield problem, {"name": name, **labels}, Point(problem.scene, composed(patch, problem.patch(cell, n)),
                                                            problem.samples)  # fmt: skip

@@ -19,9 +19,11 @@ import math
 import pathlib
 import sys
 
-from study import BASES, ROOT, SCHEMES, Point, Store, at, last, markdown, merged, number, series, write_csv
+import study
+from study import BASES, ROOT, Point, Store, at, last, markdown, merged, number, series, write_csv
 
 G = 9.81
+SCHEMES = {**study.SCHEMES, "keep": {"scheme": "anchored", "keep": 0.1}}
 
 
 @dataclasses.dataclass
@@ -49,6 +51,7 @@ class Case:
     samples: int = 20
     seconds: float = 120
     quick: tuple = ()  # labels of `vary` that the quick table has; none: not in it
+    why: str = ""  # what is behind the verdicts that are no pass
 
 
 def energy_gain(result):
@@ -118,68 +121,98 @@ CASES = [
         Measure("column", lambda r: last(r, "column.y"), 0.2617, 0.15, "P2/P1 FEM; h = 4 m has some % of its own"),
         Measure("pressure RMS", lambda r: last(r, "pressure_error"), 0, 0.6, "of the FEM pressure's spread; h = 4 m")],
         {f"nu = {nu}": {"materials": {"rubber": {"poisson_ratio": nu}}} for nu in (0.499, 0.4999, 0.49999)},
-        quick=("nu = 0.499",)),
+        quick=("nu = 0.499",),
+        why="Without F̄ the pressure is noise that grows with K, and uGIMP is too stiff as well; zhao creeps, with "
+        "cubic splines at nu = 0.499 past the tolerance."),
     Case("disk, 10 turns", "hard-rotating-disk", [
         Measure("angular momentum", spin_left, 1, 0.1, "exact"),
-        Measure("energy gained", energy_gain, 0, 1e-3, "nothing brings any in")]),
+        Measure("energy gained", energy_gain, 0, 1e-3, "nothing brings any in")],
+        why="FLIP on a grid loses spin, whatever the scheme: the disk's radius is 4 cells. Linear: cell crossings "
+        "turn particles inside out."),
     Case("disk collision", "disk-collision", [
         Measure("momentum", momentum_off, 0, 1e-10, "exact; round-off of some thousand steps"),
-        Measure("energy left", total_left, 0.85, 0.25, "elastic; standard quadratic B-splines keep 0.76"), NO_GAIN]),
+        Measure("energy left", total_left, 0.85, 0.25, "elastic; standard quadratic B-splines keep 0.76"), NO_GAIN],
+        why="zhao takes a third to a half of the energy, and with B-splines gives a little at the rebound (it has no "
+        "energy proof). Linear: cell crossings."),
     Case("bar impact", "hard-bar-impact", [
         Measure("length", lambda r: last(r, "length"), 0.2483, 0.15, "h = 0.05 m, quadratic B-splines, anchored"),
-        NO_GAIN, DRIFT], {"10 m/s": {}}, quick=("10 m/s",)),
+        NO_GAIN, DRIFT], {"10 m/s": {}}, quick=("10 m/s",),
+        why="Without F̄ the bar locks. zhao has the length right, but the volumes of forces and stresses part. Linear: "
+        "cell crossings."),
     Case("bar impact", "hard-bar-impact-fast", [
         Measure("length at 0.025 s", lambda r: at(r, "length", 0.025), 0.2373, 0.15,
                 "h = 0.05 m, quadratic B-splines, anchored"), NO_GAIN, DRIFT],
-        {"40 m/s": {}}),
+        {"40 m/s": {}},
+        why="As at 10 m/s; B-splines without F̄ are within the tolerance, since inertia rules."),
     Case("stretch to 4 x", "hard-stretch", [
         Measure("stretch of the middle", lambda r: 1 + last(r, "middle.x") / 1.5, 4, 0.05, "exact"), DRIFT],
-        seconds=60),
+        {f"{n} per cell": {"bodies": {"strip": {"particles_per_cell": n}}} for n in (9, 49)},
+        seconds=60,
+        why="With 9 particles per cell they end 1.3 cells apart: the body parts numerically, with every scheme. With "
+        "49 it does not, but F̄ by anchored (and by zhao with uGIMP) lets particles gather within cells, which "
+        "nothing but the shear modulus resists, until it tears."),
     Case("dead load on a column", "hard-dead-load", [
-        Measure("displacement", lambda r: last(r, "middle.x"), 0.75, 0.05, "exact"), DRIFT], seconds=60),
+        Measure("displacement", lambda r: last(r, "middle.x"), 0.75, 0.05, "exact"), DRIFT], seconds=60,
+        why="A load on the outermost particles meets a stress that F̄ averages over a cell: the layer comes off "
+        "(method.md, section 4). Spread the load over a cell. zhao with B-splines holds it, with volumes far "
+        "apart."),
     Case("residual strength 0.05 kPa", "hard-residual-strength", [
         Measure("run-out", lambda r: last(r, "runout"), 29.9, 0.1, "h = 0.25 m with the anchored F-bar: 29.98, 29.82"),
-        NO_GAIN, DRIFT]),
+        NO_GAIN, DRIFT],
+        why="Without F̄ the slope locks (linear, uGIMP most); zhao's volumes part; cubic splines run out less at this "
+        "h. Linear with F̄: cell crossings."),
     Case("footing at a tenth of the rate", "hard-footing-slow", [
-        Measure("load", lambda r: last(r, "load.y"), 5.14159, 0.15, "2 + pi; FEM at this h 5.29"), DRIFT]),
+        Measure("load", lambda r: last(r, "load.y"), 5.14159, 0.15, "2 + pi; FEM at this h 5.29"), DRIFT],
+        why="Without F̄ too stiff. zhao with B-splines: the load creeps away in so many steps."),
     Case("dam break", "hard-dam-break", [
         Measure("front at 0.336 s", lambda r: at(r, "front", 0.336), 5.0, 0.05, "h = 0.25 m, 25 per cell, K = 2e9"),
         NO_GAIN],
         {f"K = {k:g}, CFL {cfl}": {"materials": {"water": {"bulk_modulus": k}}, "time": {"cfl": cfl, "end": 0.672},
                                    "stages": [{"name": "settle", "duration": settle(k), "damping": {"local": 0.5}},
                                               {"name": "flow", "remove": {"walls": ["gate"]}}]}
-         for k in (2e6, 2e7, 2e8, 2e9) for cfl in (0.1, 0.3, 0.5) if k < 2e9 or cfl > 0.1},
-        bases=("gimp", "bspline2"), samples=16, quick=("K = 2e+06, CFL 0.5",)),
+         for k in (2e6, 2e7, 2e8, 2e9) for cfl in (0.1, 0.3, 0.5)},
+        bases=("gimp", "bspline2"), samples=16, quick=("K = 2e+06, CFL 0.5",),
+        why="Only without F̄: uGIMP is late from K = 2e7 on, quadratic splines at 2e9."),
     Case("dam break to 6 s", "hard-dam-break", [NO_GAIN],
-         {"K = 2e7": {"time": {"end": 6}}}, samples=60),
+         {"K = 2e7": {"time": {"end": 6}}}, samples=60,
+        why="Linear: cell crossings."),
     Case("one particle per cell", "hard-one-per-cell", [
         Measure("weight", lambda r: last(r, "floor_force.y"), -19570.95, 0.01, "exact"),
         Measure("pressure", lambda r: last(r, "pressure_error"), 0, 0.1, "largest error over that at the foot")],
-        {"1": {}}, quick=("1",)),
+        {"1": {}}, quick=("1",),
+        why="zhao never comes to rest; its pressure is off by that much of the pressure at the foot."),
     Case("49 particles per cell", "hard-many-per-cell", [
         Measure("weight", lambda r: last(r, "floor_force.y"), -19570.95, 0.01, "exact"),
-        Measure("pressure", lambda r: last(r, "pressure_error"), 0, 0.1, "largest error over that at the foot")]),
+        Measure("pressure", lambda r: last(r, "pressure_error"), 0, 0.1, "largest error over that at the foot")],
+        why="As with one particle per cell."),
     Case("on edges, walls, corners", "hard-on-edges", [
         Measure("weight", lambda r: last(r, "floor.y"), -9810, 0.01, "exact"),
         Measure("top", lambda r: last(r, "top"), 1, 0.03, "exact: 3 mm below 1 m; 3 % is a tenth of a cell")],
-        {"": {}}, quick=("",)),
+        {"": {}}, quick=("",),
+        why="Linear only: particles that barely reach a node."),
     Case("lone particle", "hard-lone-particle", [
         Measure("height at 0.5 s", flight_off("y"), 0, 0.0044, "free flight; a step's increment acts on its whole step: g t dt/2"),
         Measure("distance at 0.5 s", flight_off("x"), 0, 1e-9, "free flight, no force"),
         Measure("energy gained", energy_gain, 0, 0.01, "a step's work of gravity")],
-        {"": {}}, quick=("",)),
+        {"": {}}, quick=("",),
+        why="Linear only: in the last cell before the wall its volume becomes negative."),
     Case("resting column", "hard-resting-column", [
         Measure("pressure", lambda r: last(r, "pressure"), 4905, 0.05, "exact"),
         Measure("sinking of the top", lambda r: (last(r, "top") - at(r, "top", 0)) / 0.005, 0, 0.2,
                 "over the 5 mm that the column is compressed by"),
         Measure("kinetic energy", lambda r: last(r, "energy.kinetic"), 0, 1e-3 * 4.0, "of the strain energy, 4 J")],
-        {"1e6 steps": {}, "2e4 steps": {"time": {"end": 44}}}, seconds=300, quick=("2e4 steps",)),
+        {"1e6 steps": {}, "2e4 steps": {"time": {"end": 44}}}, seconds=300, quick=("2e4 steps",),
+        why="F̄ has no stiffness against motions whose change of volume cancels within every cell (the particles "
+        "around every other node move together), and water resists nothing else: at the free surface, where few "
+        "particles carry a node, they are pushed. zhao collapses; anchored with B-splines sinks by 42 and 11 mm in "
+        "2e4 steps and then farther; with a = 1 by less than 4 mm (`schemes.csv`), without F̄ not at all."),
     Case("free fall of 1,000 cells", "hard-free-fall", [
         Measure("speed", fall_off, 0, 1e-12, "exact; round-off of 9,000 steps"),
         Measure("stress", fall_stress, 0, 1e-11,
                 "exact 0; a position of 1,000 cells is known to 1e-13 of a cell, the speed is 400 cells/s"),
         Measure("drift", lambda r: number(r["series"][-1]["drift"]), 0, 1e-11, "exact 0, as the stress")],
-        {"": {}}, quick=("",)),
+        {"": {}}, quick=("",),
+        why="Linear without F̄: the stress is 1.05e-11 of Young's modulus, round-off."),
 ]  # fmt: skip
 
 
@@ -234,7 +267,7 @@ def table(rows):
     return markdown(lines.values(), columns)
 
 
-def study(store, quick=False, names=(), say=None):
+def judge(store, quick=False, names=(), say=None):
     wanted = list(points([c for c in CASES if not names or c.name in names], quick))
     results = store.all([p for _, _, p in wanted], say=say)
     return [judged(case, labels, result) for (case, labels, _), result in zip(wanted, results)]
@@ -252,7 +285,7 @@ def main():
         if sys.stderr.isatty() or n == of:
             print(f"{n} of {of}: {point.scene}", file=sys.stderr)
 
-    rows = study(Store(options.output / "points.jsonl"), options.quick, options.cases, say)
+    rows = judge(Store(options.output / "points.jsonl"), options.quick, options.cases, say)
     write_csv(options.output / "hard-cases.csv", rows)
     (options.output / "hard-cases.md").write_text(table(rows))
     kept = pathlib.Path(__file__).with_name("verdicts.csv")

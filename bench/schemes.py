@@ -1,6 +1,6 @@
 #!/usr/bin/env python3
 """`zhao` against `anchored`, and what the constants of `anchored` do: static and dynamic problems and hard cases, for
-a from 0.02 to 1, C from 0 to 2, and a = clamp(25 mu/K, 0.02, 1).
+a from 0.02 to 1, C from 0 to 2, keep up to 0.1, and a = clamp(25 mu/K, 0.02, 1).
 
     bench/schemes.py [-o FOLDER]
 
@@ -25,6 +25,15 @@ def at_rest(result):
     return number(end["kinetic"]) / max(number(end["strain"]), 1e-300)
 
 
+# The same in 3D, by merge patches.
+BALLS = {"dimension": 3, "cell": 0.1, "domain": {"min": [-0.2] * 3, "max": [1.2] * 3}, "references": [], "bodies": {
+    name: {"shape": {"disk": None, "sphere": {"center": [x] * 3, "radius": 0.2}}, "particles_per_cell": 8, "velocity": [v] * 3}
+    for name, x, v in (("lower", 0.2, 0.1), ("upper", 0.8, -0.1))}}  # fmt: skip
+COLUMN_3D = {"dimension": 3, "domain": {"min": [-0.25, -0.25, -0.25], "max": [0.5, 1.25, 0.5]}, "gravity": [0, -9.81, 0], "bodies": {
+    "column": {"shape": {"box": {"min": [0, 0, 0], "max": [0.25, 1, 0.25]}}, "particles_per_cell": 8}}, "walls": {
+    "near": {"axis": "z", "at": 0, "keeps": "above", "condition": "slip"},
+    "far": {"axis": "z", "at": 0.25, "keeps": "below", "condition": "slip"}}}  # fmt: skip
+
 COOK = {"materials": {"rubber": {"poisson_ratio": 0.499}}, "time": {"end": 120}}
 # name: scene, patch, mu/K, measures
 PROBLEMS = {
@@ -40,6 +49,13 @@ PROBLEMS = {
         "pressure error": lambda r: last(r, "pressure_error"), "kinetic/strain": at_rest}),
     "resting column, 2e4 steps": ("hard-resting-column", {"time": {"end": 44}}, 0.0, {
         "top, m": lambda r: last(r, "top") - at(r, "top", 0), "kinetic/strain": at_rest}),
+    "resting column in 3D, 1e4 steps": ("hard-resting-column", {**COLUMN_3D, "time": {"end": 22}}, 0.0, {
+        "top, m": lambda r: last(r, "top") - at(r, "top", 0), "kinetic/strain": at_rest}),
+    "balls in 3D": ("disk-collision", BALLS, 0.002, {"energy left": energy_left}),
+    "dead load": ("hard-dead-load", {}, 0.002, {"displacement, m": lambda r: last(r, "middle.x")}),
+    "stretch to 4 x, 49 per cell": ("hard-stretch", {"bodies": {"strip": {"particles_per_cell": 49}}}, 0.002, {
+        "stretch": lambda r: 1 + last(r, "middle.x") / 1.5}),
+    "footing, slow": ("hard-footing-slow", {}, 0.02, {"load": lambda r: last(r, "load.y")}),
     "dam break, K = 2e7": ("hard-dam-break", {"time": {"end": 0.672}}, 0.0, {
         "front at 0.336 s, m": lambda r: at(r, "front", 0.336), "largest pressure at the end, Pa": lambda r: last(r, "pressure_max")}),
     "disk collision": ("disk-collision", {}, 0.002, {"energy left": energy_left}),
@@ -56,6 +72,8 @@ def variants(ratio):
         yield f"a = {a}, C = 1", {"scheme": "anchored", "a": a, "C": 1}
     for C in (0, 2):
         yield f"a = 0.05, C = {C}", {"scheme": "anchored", "a": 0.05, "C": C}
+    for keep in (0.05, 0.1):
+        yield f"a = 0.05, C = 1, keep = {keep}", {"scheme": "anchored", "a": 0.05, "C": 1, "keep": keep}
     yield "a = 1, C = 0", {"scheme": "anchored", "a": 1.0, "C": 0}
     a = min(1.0, max(0.02, 25 * ratio))
     yield f"formula: a = {a:g}, C = 1", {"scheme": "anchored", "a": a, "C": 1}

@@ -102,6 +102,7 @@ static struct mpm_fbar read_fbar(const cJSON *json) {
         .scheme = (enum mpm_fbar_scheme)mpm_fbar_parse(text(json, "scheme")),
         .a = number(json, "a"),
         .C = number(json, "C"),
+        .keep = number(json, "keep"),
     };
 }
 
@@ -852,7 +853,7 @@ static void drop_stale_fbar(cJSON *merged, const cJSON *patch) {
     const cJSON *change = json_member(patch, "fbar");
     if (!cJSON_IsObject(change) || text_is(fbar, "scheme", mpm_fbar_name(MPM_FBAR_ANCHORED)))
         return;
-    static const char *const keys[] = {"a", "C"};
+    static const char *const keys[] = {"a", "C", "keep"};
     for (size_t i = 0; i < sizeof keys / sizeof *keys; i++)
         if (!json_member(change, keys[i]) && (stale = json_member(fbar, keys[i])))
             cJSON_Delete(cJSON_DetachItemViaPointer(fbar, stale));

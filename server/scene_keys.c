@@ -299,6 +299,12 @@ static const struct scene_key fbar_keys[] = {
      .doc = "weight of the anchor"},
     {"C", NOT_NEGATIVE("1"), .fallback = "1", .only = 1U << MPM_FBAR_ANCHORED,
      .doc = "how fast history is forgotten with travel; 0 = never"},
+    {"keep",
+     {.type = SCENE_NUMBER, .unit = "1", .min = 0, .max = 1},
+     .fallback = "0",
+     .only = 1U << MPM_FBAR_ANCHORED,
+     .doc = "share of the volume change that is not averaged; 0.1 for loads on outermost particles, "
+            "large stretch and fluids that rest for long (docs/method.md)"},
     END};
 static const struct scene_value fbar_forms[] = {
     BOOL, {.type = SCENE_OBJECT, .keys = fbar_keys, .section = "`fbar` as an object"}};

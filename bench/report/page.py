@@ -29,6 +29,7 @@ class Table:
     rows: list
     caption: str = ""
     shown: int = 40  # more rows than that are in the CSV only
+    docs: bool = False  # also in docs/report.md, with its CSV
 
 
 @dataclasses.dataclass
@@ -43,6 +44,7 @@ class Section:
     verdict: tuple  # (one of VERDICTS, why)
     pictures: list = dataclasses.field(default_factory=list)
     tables: list = dataclasses.field(default_factory=list)
+    data: list = dataclasses.field(default_factory=list)  # names of CSV files beside the page that docs keep too
     missing: list = dataclasses.field(default_factory=list)  # cases that it would show and that are not there
 
 
@@ -87,6 +89,17 @@ def write_table(table, folder):
             + "".join(f"<tr>{c}</tr>" for c in cells) + "</table></div>")  # fmt: skip
 
 
+def markdown(table, place):
+    """The table as lines of Markdown, and where its CSV is."""
+
+    def cell(value):
+        return html.unescape(number(value)).replace("|", "\\|").replace("\n", " ")
+
+    lines = ["", f"{table.caption}" + (f" ([CSV]({place}/{table.file}))" if table.file else ""), ""]
+    lines += ["| " + " | ".join(map(cell, table.header)) + " |", "|" + "---|" * len(table.header)]
+    return lines + ["| " + " | ".join(map(cell, row)) + " |" for row in table.rows]
+
+
 def write_section(section, folder):
     word, why = section.verdict
     out = [f'<section id="{section.anchor}"><h3>{html.escape(section.title)}</h3>']
@@ -120,7 +133,7 @@ def write_docs(parts, shelf, folder, size, docs):
     Of what write() has drawn."""
     kept = docs / "report" / size
     kept.mkdir(parents=True, exist_ok=True)
-    for old in kept.glob("*.png"):
+    for old in [*kept.glob("*.png"), *kept.glob("*.csv")]:
         old.unlink()
     there = [r for r in (shelf.get(c.name) for c in shelf.cases) if r]
     out = ["# The paper's figures with our numbers", "",
@@ -141,6 +154,14 @@ def write_docs(parts, shelf, folder, size, docs):
                     out += [f"![{picture.caption}](report/{size}/{picture.file})", "", f"*{picture.caption}*", ""]
             out += [f"The paper: {s.paper}", "", f"Measured: {s.measured}", "", f"Against: {s.reference}", "",
                     f"**Verdict: {s.verdict[0]}.** {s.verdict[1]}"]  # fmt: skip
+            for table in s.tables:
+                if table.docs:
+                    out += markdown(table, f"report/{size}")
+                    if table.file:
+                        (kept / table.file).write_bytes((folder / table.file).read_bytes())
+            for name in s.data:
+                if (folder / name).exists():
+                    (kept / name).write_bytes((folder / name).read_bytes())
             out += ["", f"Not run yet: {', '.join(s.missing)}."] if s.missing else []
     path = docs / ("report.md" if size == "paper" else f"report-{size}.md")
     path.write_text("\n".join(out) + "\n", encoding="utf-8")

@@ -75,6 +75,10 @@ enum mpm_status mpm_check_settings(const struct mpm_settings *s, const char *poi
         if (!(s->fbar.C >= 0 && is_finite(s->fbar.C))) {
             return range_fault(err, pointer, "/fbar/C", "at least 0", s->fbar.C);
         }
+        if (!(s->fbar.keep >= 0 && s->fbar.keep <= 1)) {
+            return range_fault(err, pointer, "/fbar/keep", "at least 0 and at most 1",
+                               s->fbar.keep);
+        }
     }
     for (int d = 0; d < dim; d++) {
         if (!is_finite(s->gravity[d])) {

@@ -137,7 +137,7 @@ const struct mpm_parameter *mpm_material_parameter(const struct mpm_material *mo
 
 struct mpm_fbar {
     enum mpm_fbar_scheme scheme;
-    double a, C; // of MPM_FBAR_ANCHORED (docs/method.md), else unused
+    double a, C, keep; // of MPM_FBAR_ANCHORED (docs/method.md), else unused
 };
 
 struct mpm_material_def {

@@ -459,7 +459,8 @@ static enum mpm_status step(struct mpm_sim *sim, struct mpm_error *err) {
                                       .fbar = averaged,
                                       .scheme = scheme,
                                       .a = now->fbar.a,
-                                      .C = now->fbar.C};
+                                      .C = now->fbar.C,
+                                      .keep = now->fbar.keep};
         for_particles(sim, b, span, averaged, g2p, &found);
     }
     charge(sim, MPM_PHASE_G2P, &clock);
@@ -471,7 +472,10 @@ static enum mpm_status step(struct mpm_sim *sim, struct mpm_error *err) {
         mpm_walls_mirror_fbar(sim->walls, sim->n_walls, &sim->grid);
         for (size_t b = 0; b < sim->n_sets; b++) {
             if (sim->sets[b].wants_fbar) {
-                const struct mpm_span span = {.fbar = true, .scheme = scheme, .C = now->fbar.C};
+                const struct mpm_span span = {.fbar = true,
+                                              .scheme = scheme,
+                                              .C = now->fbar.C,
+                                              .keep = now->fbar.keep};
                 for_particles(sim, b, span, false, fbar, &found);
             }
         }

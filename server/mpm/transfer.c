@@ -370,6 +370,10 @@ MPM_KERNEL void fbar_finish(const struct mpm_span *span, struct mpm_span_result 
             B += ROW_WEIGHT(t, dim) * B_row;
         }
         const double trial = mpm_ratio_in_use(s, p);
+        if (scheme == MPM_FBAR_ANCHORED) { // what is not averaged resists motion within a cell
+            A = (1 - span->keep) * A + span->keep * s->dJ[p];
+            B = (1 - span->keep) * B + span->keep * A * (s->V[p] / s->V0[p]);
+        }
         const double ratio = scheme == MPM_FBAR_ANCHORED ? B : A;
         if (!(trial > 0 && ratio > 0)) {
             fault(&r, p, MPM_ERR_VOLUME, trial > 0 ? ratio : trial);

@@ -12,7 +12,7 @@ struct mpm_span {
     double dt, blend;
     bool fbar;                   // this body takes part in F-bar in this step
     enum mpm_fbar_scheme scheme; // if so, by which scheme
-    double a, C;                 // of the anchored one
+    double a, C, keep;           // of the anchored one
 };
 
 // What a pass found in its span, joined in span order.

@@ -698,14 +698,15 @@ MPM_KERNEL mpm_vec ratio_of(const mpm_vec *kept, const int dim,
 
 // What a step does to particles.
 struct by {
-    double dt, blend, inv_h, a, C;
+    double dt, blend, inv_h, a, C, keep;
 };
 MPM_KERNEL struct by what_by(const struct mpm_span *span) {
     return (struct by){.dt = span->dt,
                        .blend = span->blend,
                        .inv_h = span->grid->inv_h,
                        .a = span->a,
-                       .C = span->C};
+                       .C = span->C,
+                       .keep = span->keep};
 }
 
 // The stages of an update are short loops over the vectors of a batch, so that the processor has
@@ -808,11 +809,15 @@ MPM_KERNEL void rescale(struct batch *b, struct extent in, int lane,
         dx2 += dx * dx;
     }
     const mpm_vec trial = ratio_of(kept, dim, kinematics);
-    const mpm_vec A = get(in, lane, &b->ratio[0][lane], 1, whole);
+    mpm_vec A = get(in, lane, &b->ratio[0][lane], 1, whole);
     double *to_V = at(s->V, in, lane, 1, 0);
-    mpm_vec ratio = A, V = fetch(in, lane, s->V, 1, 0, 1, whole);
+    mpm_vec ratio = A, V = fetch(in, lane, s->V, 1, 0, 1, whole), V0 = mpm_splat(0);
     if (scheme == MPM_FBAR_ANCHORED) {
-        ratio = get(in, lane, &b->ratio[1][lane], 1, whole);
+        const mpm_vec dJ = fetch(in, lane, s->dJ, 1, 0, 1, whole);
+        V0 = fetch(in, lane, s->V0, 1, 0, 1, whole);
+        A = (1 - by->keep) * A + by->keep * dJ;
+        ratio = (1 - by->keep) * get(in, lane, &b->ratio[1][lane], 1, whole) +
+                by->keep * A * (V / V0);
     }
     fault_unless(trial > 0.0, r, in, lane, MPM_ERR_VOLUME, trial);
     fault_unless(ratio > 0.0, r, in, lane, MPM_ERR_VOLUME, ratio);
@@ -820,7 +825,6 @@ MPM_KERNEL void rescale(struct batch *b, struct extent in, int lane,
     if (scheme == MPM_FBAR_ANCHORED) {
         const mpm_vec reach = (by->C * by->inv_h) * mpm_sqrt(dx2);
         const mpm_vec beta = mpm_min(reach, mpm_splat(1));
-        const mpm_vec V0 = fetch(in, lane, s->V0, 1, 0, 1, whole);
         V = (1.0 - beta) * V * A + beta * V0 * ratio;
     } else { // eq. 15: forces use the unaveraged volume; but a fluid's follows Jbar
         const mpm_vec dJ = fetch(in, lane, s->dJ, 1, 0, 1, whole);
