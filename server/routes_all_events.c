@@ -161,7 +161,7 @@ static size_t watch_produce(void *context, char *out, size_t bytes) {
 }
 
 void routes_serve_all_events(struct call *c) {
-    struct watch *w = routes_stream_begins(c) ? calloc(1, sizeof *w) : NULL;
+    struct watch *w = routes_stream_begins(c, sizeof *w);
     if (w == NULL)
         return;
     w->routes = c->routes;

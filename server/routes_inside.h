@@ -57,8 +57,9 @@ struct run *routes_run_of(struct call *c);
 // journal holds.
 cJSON *routes_recorders_json(struct run *run);
 cJSON *routes_journal_json(struct run *run);
-// Counts a stream; false when the reply is a 503: too many are open.
-bool routes_stream_begins(struct call *c);
+// Counts a stream; its state, zeroed, which the stream frees when it ends. NULL when the reply is a
+// 503: too many are open, or there is no memory.
+void *routes_stream_begins(struct call *c, size_t bytes);
 // What of a frame is asked for in the query; false when the reply is a 400.
 bool routes_thinning(struct call *c, struct thin *out);
 // A whole number of the query, 0 or more, `absent` when it is not there; false when the reply is a

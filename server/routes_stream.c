@@ -13,12 +13,18 @@
 #define HEARTBEAT_SECONDS 10.0 // a peer that is gone is noticed when something is sent to it
 #define WAIT_SECONDS 0.5       // the server looks in between whether the peer is still there
 
-bool routes_stream_begins(struct call *c) {
-    if (atomic_fetch_add(&c->routes->streams, 1) < ROUTES_STREAMS_MAX)
-        return true;
+void *routes_stream_begins(struct call *c, size_t bytes) {
+    void *stream = NULL;
+    if (atomic_fetch_add(&c->routes->streams, 1) < ROUTES_STREAMS_MAX) {
+        stream = calloc(1, bytes);
+        if (stream != NULL)
+            return stream;
+        reply_problem(c->reply, 503, NULL, "no memory for another stream now");
+    } else {
+        reply_problem(c->reply, 503, NULL, "%d streams are open already", ROUTES_STREAMS_MAX);
+    }
     atomic_fetch_sub(&c->routes->streams, 1);
-    reply_problem(c->reply, 503, NULL, "%d streams are open already", ROUTES_STREAMS_MAX);
-    return false;
+    return NULL;
 }
 
 // Whether nothing more will come. Ask it before looking for what has come.
@@ -194,7 +200,7 @@ void routes_serve_events(struct call *c) {
     struct run *run = routes_run_of(c);
     if (run == NULL)
         return;
-    struct event_stream *s = routes_stream_begins(c) ? calloc(1, sizeof *s) : NULL;
+    struct event_stream *s = routes_stream_begins(c, sizeof *s);
     if (s == NULL) {
         run_release(run);
         return;
@@ -310,7 +316,7 @@ void routes_serve_stream(struct call *c) {
     struct run *run = routes_run_of(c);
     if (run == NULL)
         return;
-    struct frame_stream *s = routes_stream_begins(c) ? calloc(1, sizeof *s) : NULL;
+    struct frame_stream *s = routes_stream_begins(c, sizeof *s);
     if (s == NULL) {
         run_release(run);
         return;
