@@ -146,8 +146,15 @@ $(B)/gen/page_data.c: $(PAGE) Makefile
 	$(call embed,$(PAGE),page_data,*/,)
 $(CHARTJS):
 	@echo "$@ is missing: make deps installs it (Debian's libjs-chart.js), or set CHARTJS"; exit 1
+# The points of `fbar bench accuracy`.
+$(B)/gen/bench_accuracy.c: bench/accuracy.json Makefile
+	$(call say,EMBED,$<)
+	@mkdir -p $(@D)
+	$(Q){ echo 'extern const char bench_accuracy_json[];'; echo 'const char bench_accuracy_json[] = {'; \
+	  od -An -v -tx1 $< | sed "s/ \([0-9a-f][0-9a-f]\)/'\\\\x\1',/g"; echo '0};'; } > $@
 GEN_OBJ = $(addprefix $(B)/obj/gen/,scenes_data.o tables_data.o page_data.o)
-$(GEN_OBJ): $(B)/obj/gen/%.o: $(B)/gen/%.c
+BENCH_POINTS = $(B)/obj/gen/bench_accuracy.o
+$(GEN_OBJ) $(BENCH_POINTS): $(B)/obj/gen/%.o: $(B)/gen/%.c
 	@mkdir -p $(@D)
 	$(Q)$(CC) $(ALL_CFLAGS) -c $< -o $@
 
@@ -155,7 +162,7 @@ SERVER_OBJ = $(filter-out %/main.o,$(call obj,$(SERVER_SRC))) $(GEN_OBJ)
 $(B)/fbard: $(call obj,server/main.c) $(SERVER_OBJ) $(call obj,$(PROTO_SRC)) $(B)/libmpm.a
 	$(call say,LD,$@)
 	$(Q)$(CC) $(ALL_LDFLAGS) -pthread $(OPENMP) $^ $(call pc_libs,$(SERVER_LIBS)) -lm -o $@
-$(B)/fbar: $(call obj,$(CLIENT_SRC)) $(call obj,$(PROTO_SRC))
+$(B)/fbar: $(call obj,$(CLIENT_SRC)) $(call obj,$(PROTO_SRC)) $(BENCH_POINTS)
 	$(call say,LD,$@)
 	$(Q)$(CC) $(ALL_LDFLAGS) -pthread $^ $(call pc_libs,$(CLIENT_LIBS)) -lm -o $@
 

@@ -48,4 +48,4 @@ struct command {
 
 extern const struct command cmd_run, cmd_scenes, cmd_validate, cmd_list, cmd_show, cmd_start,
     cmd_pause, cmd_resume, cmd_step, cmd_cancel, cmd_set, cmd_watch, cmd_record, cmd_probes,
-    cmd_info, cmd_plot, cmd_recover, cmd_delete, cmd_keygen, cmd_completion;
+    cmd_info, cmd_plot, cmd_recover, cmd_delete, cmd_keygen, cmd_completion, cmd_bench;

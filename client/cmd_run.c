@@ -8,6 +8,7 @@
 
 #include "client/arguments.h"
 #include "client/client.h"
+#include "client/cmd_run.h"
 #include "client/daemon.h"
 #include "client/interrupt.h"
 #include "client/overrides.h"
@@ -139,7 +140,7 @@ static int follow(struct client *client, const struct arguments *arguments, cons
         if (file && !client->json)
             printf("%s: %zu frames, %.1f MB%s\n", file, result.n_frames,
                    1e-6 * (double)result.bytes, result.complete ? "" : ", not complete");
-        if (code == CLIENT_DONE && private && !file && !client->json)
+        if (code == CLIENT_DONE && private && !file && !client->json && arguments->n_positionals > 0)
             terminal_note("nothing of it is kept; -o FILE.h5 records every frame");
         if (code == CLIENT_DONE)
             code = outcome;
@@ -180,6 +181,11 @@ static int create_and_follow(struct client *client, const struct arguments *argu
         result = follow(client, arguments, id ? id : "", private);
     cJSON_Delete(run);
     return result;
+}
+
+int cmd_run_body(struct client *client, const char *body, bool private) {
+    static const struct arguments none; // no scene: what runs is no run that anybody wants to keep
+    return create_and_follow(client, &none, body, private);
 }
 
 static int run(struct client *client, const struct arguments *arguments) {

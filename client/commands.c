@@ -10,7 +10,7 @@
 
 #define GROUP(...) ((const struct command *const[]){__VA_ARGS__, NULL})
 const struct commands_group commands_groups[] = {
-    {"compute", GROUP(&cmd_run, &cmd_scenes, &cmd_validate)},
+    {"compute", GROUP(&cmd_run, &cmd_scenes, &cmd_validate, &cmd_bench)},
     {"runs of a daemon", GROUP(&cmd_list, &cmd_show, &cmd_watch, &cmd_probes, &cmd_set, &cmd_pause,
                                &cmd_resume, &cmd_start, &cmd_step, &cmd_cancel, &cmd_delete)},
     {"recordings", GROUP(&cmd_record, &cmd_info, &cmd_plot, &cmd_recover)},

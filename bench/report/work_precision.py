@@ -40,7 +40,7 @@ class Measured:
             row = {**r, "cell": float(r["cell"]), "error": number(r["error"]), "cpu_s": number(r["cpu_s"]),
                    "particle_steps": number(r["particle_steps"])}  # fmt: skip
             default = {**accuracy.DEFAULT, "ppc": ppc[r["problem"]]}
-            row["changed"] = [f for f in FACTORS if str(default[f]) != r[f]]
+            row["changed"] = [f for f in FACTORS if default[f] != float(r[f])]
             self.rows.append(row)
 
     def measures(self):
@@ -132,7 +132,7 @@ def by_basis(data):
 
 def by_factor(data):
     def is_one(factor, value):
-        return lambda r: (r["basis"], r["scheme"]) == ("bspline2", "anchored") and r["changed"] == [factor] and r[factor] == str(value)
+        return lambda r: (r["basis"], r["scheme"]) == ("bspline2", "anchored") and r["changed"] == [factor] and float(r[factor]) == value
 
     return comparison(data, "work-factors.csv", "One factor at a time from the default: the same",
                       {FACTORS[f].format(v): is_one(f, v) for f, values in accuracy.FACTORS.items() for v in values})  # fmt: skip

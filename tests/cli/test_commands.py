@@ -12,7 +12,7 @@ import pytest
 import conftest
 
 COMMANDS = ("run scenes validate list show start pause resume step cancel set watch record probes info "
-            "plot recover delete").split()
+            "plot recover delete bench").split()
 
 
 def test_help_names_every_command(fbar):
