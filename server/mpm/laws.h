@@ -4,8 +4,10 @@
 // model keeps of the deformation into the Cauchy stress in Pa, MPM_SYM(dim) components:
 //
 //   KEEPS_F  name_stress(constants, F, sigma, dim)       F: dim x dim
-//   KEEPS_B  name_stress(constants, b, a, sigma, dim)    b: MPM_SYM(dim) components, and the
-//            equivalent plastic strain a, both changed where it flows
+//   KEEPS_B  name_stress(constants, n, b, a, sigma, dim) n vectors, at most MPM_VECTORS, each with
+//            its b[v], MPM_SYM(dim) components, and equivalent plastic strain a[v], both changed
+//            where it flows; a return map is a long chain of dependent operations, so it goes in
+//            short loops over the vectors, of which the processor has several in work at a time
 //   KEEPS_J  name_stress(constants, J, sigma, dim)       adds to sigma what depends on J
 //            name_rate(constants, L, sigma, dim)         writes what depends on L, dim x dim
 //

@@ -42,12 +42,12 @@ MPM_KERNEL void mpm_store_components(double *field, size_t p, int n, const mpm_v
         double constants[MPM_MAX_CONSTANTS], none = 0;                                             \
         prepare(s->parameters, constants);                                                         \
         for (size_t p = begin; p < end; p++) {                                                     \
-            double b[6], sigma[6];                                                                 \
-            mpm_load_components(s->b, p, MPM_SYM(dim), b);                                         \
-            law##_stress((const void *)constants, b,                                               \
+            double b[1][6], sigma[1][6];                                                           \
+            mpm_load_components(s->b, p, MPM_SYM(dim), b[0]);                                      \
+            law##_stress((const void *)constants, 1, b,                                            \
                          s->plastic_strain ? &s->plastic_strain[p] : &none, sigma, dim);           \
-            mpm_store_components(s->b, p, MPM_SYM(dim), b);                                        \
-            mpm_store_components(s->sigma, p, MPM_SYM(dim), sigma);                                \
+            mpm_store_components(s->b, p, MPM_SYM(dim), b[0]);                                     \
+            mpm_store_components(s->sigma, p, MPM_SYM(dim), sigma[0]);                             \
         }                                                                                          \
     }                                                                                              \
     MPM_SPANS_2D_3D(stress)

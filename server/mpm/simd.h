@@ -16,6 +16,8 @@
 #define MPM_LANES 1
 #endif
 
+#define MPM_VECTORS 8 // that a law is given at most
+
 #define MPM_KERNEL static inline __attribute__((always_inline))
 #define MPM_UNLIKELY(condition) __builtin_expect(!!(condition), 0)
 #define MPM_ALIGNED _Alignas(64) // of an array that mpm_load_aligned reads

@@ -357,7 +357,7 @@ static void leave_stage_if_over(struct mpm_sim *sim) {
 }
 
 #define MOST_DRIFT 0.999 // cells: below 1 by more than the round-off of a position in cells
-#define MOST_RUNS 1.5    // times as many runs as after a sort: each then holds too few particles
+#define MOST_RUNS 1.2    // times as many runs as after a sort: each then holds too few particles
 #define LEAST_STEPS 10   // between two sorts for speed's sake: a sort costs about three steps
 
 // A sort is due when a particle may have drifted out of its tile's reach, or when too many have

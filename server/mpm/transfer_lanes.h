@@ -596,22 +596,33 @@ MPM_KERNEL enum mpm_kinematics kept_by(const enum mpm_law law) {
     }
 }
 
-// The stress of what is kept: F (dim x dim), b (MPM_SYM) or J (1), to which a fluid's rate part in
+// The stress of what is kept: F (dim x dim) or J (1), to which a fluid's rate part in
 // sigma is added.
-MPM_KERNEL void stress(const enum mpm_law law, const void *constants, mpm_vec *kept, mpm_vec *a,
+MPM_KERNEL void stress(const enum mpm_law law, const void *constants, mpm_vec *kept,
                        mpm_vec *sigma, const int dim) {
     switch (law) {
 #define X(name, keeps)                                                                             \
     case MPM_LAW_##name:                                                                           \
         EACH_KEEPS_F_##keeps(name##_stress(constants, kept, sigma, dim);)                          \
-            EACH_KEEPS_B_##keeps(name##_stress(constants, kept, a, sigma, dim);)                   \
-                EACH_KEEPS_J_##keeps(name##_stress(constants, kept[0], sigma, dim);) break;
+            EACH_KEEPS_J_##keeps(name##_stress(constants, kept[0], sigma, dim);) break;
         MPM_LAWS(X)
 #undef X
     default:
         break;
     }
-    (void)a;
+}
+// The same of laws that keep b, of n vectors.
+MPM_KERNEL void flow_stress(const enum mpm_law law, const void *constants, int n, mpm_vec (*b)[6],
+                            mpm_vec *a, mpm_vec (*sigma)[6], const int dim) {
+    switch (law) {
+#define X(name, keeps)                                                                             \
+    case MPM_LAW_##name:                                                                           \
+        EACH_KEEPS_B_##keeps(name##_stress(constants, n, b, a, sigma, dim);) break;
+        MPM_LAWS(X)
+#undef X
+    default:
+        break;
+    }
 }
 
 MPM_KERNEL void rate_stress(const enum mpm_law law, const void *constants, const mpm_vec *L,
@@ -835,8 +846,11 @@ MPM_KERNEL void rescale(struct batch *b, struct extent in, int lane,
     if (kinematics == MPM_KEEPS_J) {
         kept[0] = ratio;
     } else {
-        const mpm_vec scale = dim == 2 ? mpm_sqrt(q) : mpm_cbrt(q);
-        const mpm_vec factor = kinematics == MPM_KEEPS_B ? scale * scale : scale;
+        mpm_vec factor = q; // of b: the square of F's
+        if (!(kinematics == MPM_KEEPS_B && dim == 2)) {
+            const mpm_vec scale = dim == 2 ? mpm_sqrt(q) : mpm_cbrt(q);
+            factor = kinematics == MPM_KEEPS_B ? scale * scale : scale;
+        }
         const int n = n_kept(kinematics, dim);
         UNROLL for (int k = 0; k < n; k++) { // not b33 in plane strain
             if (!(kinematics == MPM_KEEPS_B && dim == 2 && k == 2)) {
@@ -847,30 +861,55 @@ MPM_KERNEL void rescale(struct batch *b, struct extent in, int lane,
     store_kept(s, in, lane, kept, dim, kinematics, whole);
 }
 
+MPM_KERNEL void put_stress(struct extent in, int lane, const struct mpm_particles *s,
+                           const mpm_vec *sigma, const int dim, const bool whole) {
+    const int n_sym = MPM_SYM(dim);
+    UNROLL for (int k = 0; k < n_sym; k++) {
+        put(in, lane, at(s->sigma, in, lane, n_sym, k), sigma[k], whole);
+        ahead(s->sigma, in, lane, n_sym, k);
+    }
+}
+
 MPM_KERNEL void update_stress(struct extent in, int lane, const struct mpm_particles *s,
                               const int dim, const enum mpm_law law, const bool whole) {
     const enum mpm_kinematics kinematics = kept_by(law);
     const int n_sym = MPM_SYM(dim);
-    mpm_vec kept[9], sigma[6], a = mpm_splat(0);
+    mpm_vec kept[9], sigma[6];
     load_kept(s, in, lane, kept, dim, kinematics, whole);
-    if (kinematics == MPM_KEEPS_J) { // adds to the rate part
-        UNROLL for (int k = 0; k < n_sym; k++) {
-            sigma[k] = get(in, lane, at(s->sigma, in, lane, n_sym, k), 0, whole);
-        }
+    UNROLL for (int k = 0; k < n_sym && kinematics == MPM_KEEPS_J; k++) { // the rate part
+        sigma[k] = get(in, lane, at(s->sigma, in, lane, n_sym, k), 0, whole);
     }
-    if (kinematics == MPM_KEEPS_B && s->plastic_strain) {
-        a = get(in, lane, at(s->plastic_strain, in, lane, 1, 0), 0, whole);
-    }
-    stress(law, s->constants, kept, &a, sigma, dim);
-    if (kinematics == MPM_KEEPS_B) { // plastic flow changes them
-        store_kept(s, in, lane, kept, dim, kinematics, whole);
-        if (s->plastic_strain) {
-            put(in, lane, at(s->plastic_strain, in, lane, 1, 0), a, whole);
-        }
-    }
-    UNROLL for (int k = 0; k < n_sym; k++) {
-        put(in, lane, at(s->sigma, in, lane, n_sym, k), sigma[k], whole);
-        ahead(s->sigma, in, lane, n_sym, k);
+    stress(law, s->constants, kept, sigma, dim);
+    put_stress(in, lane, s, sigma, dim, whole);
+}
+
+// Laws that keep b get several vectors at a time.
+MPM_KERNEL void update_flow_stress(struct extent in, const struct mpm_particles *s, const int dim,
+                                   const enum mpm_law law) {
+    for (int begin = in.begin / MPM_LANES * MPM_LANES; begin < in.end;
+         begin += MPM_VECTORS * MPM_LANES) {
+        mpm_vec b[MPM_VECTORS][6], a[MPM_VECTORS], sigma[MPM_VECTORS][6];
+        struct extent these = in; // FOR_VECTORS begins at lane 0
+        these.first += (size_t)begin;
+        these.next += (size_t)begin;
+        these.begin = in.begin > begin ? in.begin - begin : 0;
+        these.end = in.end - begin < MPM_VECTORS * MPM_LANES ? in.end - begin
+                                                             : MPM_VECTORS * MPM_LANES;
+        const int n = (these.end + MPM_LANES - 1) / MPM_LANES;
+#define LOAD(whole)                                                                                \
+    load_kept(s, these, lane, b[lane / MPM_LANES], dim, MPM_KEEPS_B, whole);                       \
+    a[lane / MPM_LANES] = s->plastic_strain                                                        \
+                              ? get(these, lane, at(s->plastic_strain, these, lane, 1, 0), 0, whole) \
+                              : mpm_splat(0)
+        FOR_VECTORS(these, LOAD)
+        flow_stress(law, s->constants, n, b, a, sigma, dim);
+#define STORE(whole)                                                                               \
+    store_kept(s, these, lane, b[lane / MPM_LANES], dim, MPM_KEEPS_B, whole);                      \
+    if (s->plastic_strain) {                                                                       \
+        put(these, lane, at(s->plastic_strain, these, lane, 1, 0), a[lane / MPM_LANES], whole);    \
+    }                                                                                              \
+    put_stress(these, lane, s, sigma[lane / MPM_LANES], dim, whole)
+        FOR_VECTORS(these, STORE)
     }
 }
 
@@ -900,7 +939,11 @@ MPM_KERNEL void finish(struct batch *b, const struct mpm_particles *s, struct mp
     struct found f = *found;
 #define STRESS(whole) update_stress(in, lane, s, dim, law, whole)
 #define POSITION(whole) update_position(b, in, lane, s, r, &f, dim, whole)
-    FOR_VECTORS(in, STRESS)
+    if (kept_by(law) == MPM_KEEPS_B) {
+        update_flow_stress(in, s, dim, law);
+    } else {
+        FOR_VECTORS(in, STRESS)
+    }
     FOR_VECTORS(in, POSITION)
     *found = f;
 }

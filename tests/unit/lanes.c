@@ -102,7 +102,7 @@ static void exp_twice(const double *e, double *b, size_t n, int dim) {
     {                                                                                              \
         mpm_vec b[6], a = mpm_load(s->a + p);                                                      \
         get(s->kept, s->n, p, MPM_SYM(dim), b);                                                    \
-        name##_stress(constants, b, &a, sigma, dim);                                               \
+        name##_stress(constants, 1, &b, &a, &sigma, dim);                                          \
         put(s->kept, s->n, p, MPM_SYM(dim), b);                                                    \
         mpm_store(s->a + p, a);                                                                    \
     }

@@ -8,11 +8,13 @@
 #include "server/mpm/spectral.h"
 
 struct hencky_j2 {
-    double two_mu, K; // Pa
-    double residual;  // Pa, sqrt(2/3) of the residual strength
-    double fall;      // Pa, sqrt(2/3) of the peak's excess over it
-    double softening; // 1
-    double per_rate;  // 1, the inverse of sqrt(2/3) softening, 0 without softening
+    double two_mu, K;  // Pa
+    double per_two_mu; // 1/Pa
+    double residual;   // Pa, sqrt(2/3) of the residual strength
+    double fall;       // Pa, sqrt(2/3) of the peak's excess over it
+    double softening;  // 1
+    double rate;       // 1, sqrt(2/3) softening: d soft/dx = -rate soft
+    double per_rate;   // 1, its inverse, 0 without softening
 };
 
 #define HENCKY_J2_ROOT 0.81649658092772603 // sqrt(2/3)
@@ -27,7 +29,7 @@ MPM_KERNEL mpm_vec hencky_j2_soft(const struct hencky_j2 *c, mpm_vec a) {
 // falling, so Newton's iterates come down to the root from above after the first.
 MPM_KERNEL mpm_vec hencky_j2_far_return(const struct hencky_j2 *c, mpm_vec norm, mpm_mask going,
                                         mpm_vec a, mpm_vec *soft) {
-    const double rate = HENCKY_J2_ROOT * c->softening; // soft' = -rate soft
+    const double rate = c->rate;
     mpm_vec x = mpm_splat(0);
     for (int k = 0; k < 50; k++) { // quadratic: 2 or 3 in practice
         const mpm_vec g = norm - c->two_mu * x - c->residual - *soft;
@@ -51,14 +53,13 @@ MPM_KERNEL mpm_vec hencky_j2_far_return(const struct hencky_j2 *c, mpm_vec norm,
 // d exceeds the solution by a part of q d/2, (q d/2)^3 and (q d)^5 or less of itself.
 #define HENCKY_J2_REACH 0.02 // of d: the series' next term is 6e-19
 #define HENCKY_J2_SLOPE 1e-3 // of q d
-MPM_KERNEL void hencky_j2_return(const struct hencky_j2 *c, mpm_vec norm, mpm_mask yields,
-                                 mpm_vec *a, mpm_vec *soft) {
+MPM_KERNEL void hencky_j2_return(const struct hencky_j2 *c, mpm_vec norm, mpm_vec compliance,
+                                 mpm_mask yields, mpm_vec *a, mpm_vec *soft) {
     if (!(c->softening > 0)) {
         *a = mpm_select(yields, *a + HENCKY_J2_ROOT / c->two_mu * (norm - c->residual - *soft), *a);
         return;
     }
-    const double rate = HENCKY_J2_ROOT * c->softening; // soft' = -rate soft
-    const mpm_vec r = rate / (c->two_mu - rate * *soft), q = *soft * r;
+    const mpm_vec r = c->rate * compliance, q = *soft * r;
     const mpm_vec above = (norm - c->residual - *soft) * r;
     const mpm_vec d0 = mpm_min(mpm_max(above, mpm_splat(0)), mpm_splat(HENCKY_J2_REACH));
     const mpm_vec d2 = d0 * d0;
@@ -82,33 +83,51 @@ MPM_KERNEL void hencky_j2_return(const struct hencky_j2 *c, mpm_vec norm, mpm_ma
     *a = mpm_select(yields, *a + HENCKY_J2_ROOT * x, *a);
 }
 
-MPM_KERNEL void hencky_j2_stress(const struct hencky_j2 *c, mpm_vec *b, mpm_vec *a, mpm_vec *sigma,
-                                 const int dim) {
-    mpm_vec e[6], norm2 = mpm_splat(0);
-    mpm_half_log(b, e, dim);
-    const mpm_vec trace = e[0] + e[1] + e[2], mean = trace * (1.0 / 3);
-    for (int k = 0; k < MPM_SYM(dim); k++) {
-        e[k] = k < 3 ? e[k] - mean : e[k];
-        norm2 += (k < 3 ? 1.0 : 2.0) * e[k] * e[k];
-    }
-    mpm_vec soft = hencky_j2_soft(c, *a);
-    const mpm_vec radius = (c->residual + soft) / c->two_mu; // as |dev eps|
-    if (mpm_any(norm2 > radius * radius)) { // the same as `yields` but for round-off
-        const mpm_vec norm = c->two_mu * mpm_sqrt(norm2), limit = c->residual + soft;
-        const mpm_mask yields = norm > limit;
-        const mpm_vec inverse = 1.0 / mpm_max(norm, limit); // ready before the return is
-        hencky_j2_return(c, norm, yields, a, &soft);
-        const mpm_vec back = mpm_select(yields, (c->residual + soft) * inverse, mpm_splat(1));
-        mpm_vec flowed[6];
-        mpm_exp_twice_less(b, e, 1.0 - back, mean, flowed, dim);
+MPM_KERNEL void hencky_j2_stress(const struct hencky_j2 *c, const int n, mpm_vec (*b)[6],
+                                 mpm_vec *a, mpm_vec (*sigma)[6], const int dim) {
+    mpm_vec dev[MPM_VECTORS][6], trace[MPM_VECTORS], norm2[MPM_VECTORS], soft[MPM_VECTORS];
+    mpm_vec back[MPM_VECTORS];
+    mpm_mask yields[MPM_VECTORS];
+    int flowing[MPM_VECTORS], n_flowing = 0; // the vectors in which something flows
+    for (int v = 0; v < n; v++) {
+        mpm_vec e[6], sum = mpm_splat(0);
+        mpm_half_log(b[v], e, dim);
+        trace[v] = e[0] + e[1] + e[2];
         for (int k = 0; k < MPM_SYM(dim); k++) {
-            e[k] *= back;
-            b[k] = mpm_select(yields, flowed[k], b[k]);
+            dev[v][k] = k < 3 ? e[k] - trace[v] * (1.0 / 3) : e[k];
+            sum += (k < 3 ? 1.0 : 2.0) * dev[v][k] * dev[v][k];
+        }
+        norm2[v] = sum;
+        soft[v] = hencky_j2_soft(c, a[v]);
+        const mpm_vec radius = (c->residual + soft[v]) * c->per_two_mu; // as |dev eps|
+        flowing[n_flowing] = v;
+        n_flowing += mpm_any(sum > radius * radius); // the same as `yields` but for round-off
+    }
+    for (int k = 0; k < n_flowing; k++) {
+        const int v = flowing[k];
+        const mpm_vec norm = c->two_mu * mpm_sqrt(norm2[v]), limit = c->residual + soft[v];
+        const mpm_vec most = mpm_max(norm, limit), stiffness = c->two_mu - c->rate * soft[v];
+        const mpm_vec inverse = 1.0 / (most * stiffness); // of both: a division takes its time
+        yields[v] = norm > limit;
+        hencky_j2_return(c, norm, inverse * most, yields[v], &a[v], &soft[v]);
+        back[v] =
+            mpm_select(yields[v], (c->residual + soft[v]) * (inverse * stiffness), mpm_splat(1));
+    }
+    for (int k = 0; k < n_flowing; k++) {
+        const int v = flowing[k];
+        mpm_vec flowed[6];
+        mpm_exp_twice_less(b[v], dev[v], 1.0 - back[v], trace[v] * (1.0 / 3), flowed, dim);
+        for (int i = 0; i < MPM_SYM(dim); i++) {
+            dev[v][i] *= back[v];
+            b[v][i] = mpm_select(yields[v], flowed[i], b[v][i]);
         }
     }
-    const mpm_vec r = mpm_exp(-trace);
-    for (int k = 0; k < MPM_SYM(dim); k++) {
-        sigma[k] = r * (k < 3 ? c->two_mu * e[k] + c->K * trace : c->two_mu * e[k]);
+    for (int v = 0; v < n; v++) {
+        const mpm_vec r = mpm_exp(-trace[v]), pressure_part = c->K * trace[v];
+        for (int k = 0; k < MPM_SYM(dim); k++) {
+            sigma[v][k] =
+                r * (k < 3 ? c->two_mu * dev[v][k] + pressure_part : c->two_mu * dev[v][k]);
+        }
     }
 }
 
@@ -177,11 +196,13 @@ static int conflict(const double *par, const char **why) {
 static void prepare(const double *par, void *constants) {
     struct hencky_j2 *c = constants;
     c->two_mu = 2 * shear_modulus(par);
+    c->per_two_mu = 1 / c->two_mu;
     c->K = bulk_modulus(par);
     c->residual = sqrt(2.0 / 3) * residual_strength(par);
     c->fall = sqrt(2.0 / 3) * (par[YIELD_STRENGTH] - residual_strength(par));
     c->softening = c->fall > 0 ? par[SOFTENING] : 0;
-    c->per_rate = c->softening > 0 ? 1 / (HENCKY_J2_ROOT * c->softening) : 0;
+    c->rate = HENCKY_J2_ROOT * c->softening;
+    c->per_rate = c->softening > 0 ? 1 / c->rate : 0;
 }
 MPM_SPANS_KEEPS_B(hencky_j2)
 
