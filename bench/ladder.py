@@ -29,10 +29,11 @@ MATERIALS = {
     "plastic": {"model": "hencky_j2", "density": 1000, "youngs_modulus": 1e6, "poisson_ratio": 0.49,
                 "yield_strength": 1e3},
 }  # fmt: skip
-STATED = {}  # (basis, dimension): CFL number of the limit
+STATED = {}  # (basis, dimension, particles in each direction of a cell): CFL number of the limit
 
 
-def cases(dimensions, bases, schemes, materials):
+def cases(dimensions, bases, schemes, materials, n=0):
+    """n: particles in each direction of a cell, 0: 2."""
     for dim, material, basis, scheme in itertools.product(dimensions, materials, bases, schemes):
         stuff = MATERIALS[material]
         patch = {"materials": {"stuff": None}, "basis": basis, "fbar": SCHEMES[scheme], "unstable_ok": True,
@@ -43,15 +44,23 @@ def cases(dimensions, bases, schemes, materials):
                                    "domain": {"min": [-32, -32, -32], "max": [96, 96, 96]},
                                    "bodies": {"block": {"shape": {"box": {"min": [0, 0, 0], "max": [1.5, 1.25, 1]}},
                                                         "particles_per_cell": 8}}})  # fmt: skip
-        yield {"dimension": dim, "material": material, "basis": basis, "scheme": scheme}, patch
+        if n:
+            patch = merged(patch, {"bodies": {"block": {"particles_per_cell": n**dim}}})
+        yield {"dimension": dim, "n": n or 2, "material": material, "basis": basis, "scheme": scheme}, patch
 
 
-def ask_limits(bases, dimensions):
+def ask_limits(wanted):
     """The daemon's own words: a scene with a CFL number of 9 is refused, and the fault names the limit."""
-    for basis, dim in itertools.product(bases, dimensions):
-        (_, patch), = cases([dim], [basis], ["standard"], ["fluid"])
-        result = run(Point("hard-dt-ladder", merged(patch, {"unstable_ok": False, "time": {"end": 1, "cfl": 9}})))
-        STATED[basis, dim] = float(re.search(r"stability limit of ([0-9.e-]+)", result["detail"])[1])
+    for labels, _ in wanted:
+        key = labels["basis"], labels["dimension"], labels["n"]
+        if key not in STATED:
+            (_, patch), = cases([key[1]], [key[0]], ["standard"], ["fluid"], key[2])
+            result = run(Point("hard-dt-ladder", merged(patch, {"unstable_ok": False, "time": {"end": 1, "cfl": 9}})))
+            STATED[key] = float(re.search(r"stability limit of ([0-9.e-]+)", result["detail"])[1])
+
+
+def stated(labels):
+    return STATED[labels["basis"], labels["dimension"], labels["n"]]
 
 
 def blown(result):
@@ -64,7 +73,7 @@ def blown(result):
 
 
 def rung(labels, patch, multiple):
-    cfl = multiple * STATED[labels["basis"], labels["dimension"]]
+    cfl = multiple * stated(labels)
     return Point("hard-dt-ladder", merged(patch, {"time": {"end": 1000, "cfl": cfl}}), samples=4000,
                  steps=STEPS[labels["dimension"]])  # fmt: skip
 
@@ -89,7 +98,7 @@ def climb(store, wanted, say):
         verdict = ("none is safe" if labels["basis"] == "linear" else "not the increment" if first == FIRST else
                    "UNSAFE" if not safe else
                    "too careful" if max(good) >= WIDEST else "safe")  # fmt: skip
-        rows.append({**labels, "limit": STATED[labels["basis"], labels["dimension"]], "whole": max(good, default=""), "blown": first or f"> {STEPS_OF_LIMIT[-1]}",
+        rows.append({**labels, "limit": stated(labels), "whole": max(good, default=""), "blown": first or f"> {STEPS_OF_LIMIT[-1]}",
                      "verdict": verdict})  # fmt: skip
     return rows
 
@@ -101,11 +110,15 @@ def main():
     options = parser.parse_args()
     materials = ["elastic, nu = 0.3", "viscous fluid"] if options.quick else list(MATERIALS)
     wanted = list(cases([2] if options.quick else [2, 3], BASES, SCHEMES, materials))
+    if not options.quick:  # many particles: uGIMP bears the less the more there are
+        for n in (7, 10):
+            wanted += cases([2], BASES[1:], ["standard"], ["elastic, nu = 0.3", "viscous fluid"], n)
+        wanted += cases([3], ["gimp"], ["standard"], ["elastic, nu = 0.3"], 5)
     store = Store(options.output / "points.jsonl")
-    ask_limits(BASES, [2] if options.quick else [2, 3])
+    ask_limits(wanted)
     rows = climb(store, wanted, lambda text: print(text, file=sys.stderr))
     write_csv(options.output / "dt-ladder.csv", rows)
-    print(markdown(rows, ["dimension", "material", "basis", "scheme", "limit", "whole", "blown", "verdict"]))
+    print(markdown(rows, ["dimension", "n", "material", "basis", "scheme", "limit", "whole", "blown", "verdict"]))
     return any(row["verdict"] in ("UNSAFE", "too careful") for row in rows)
 
 

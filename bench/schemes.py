@@ -55,7 +55,6 @@ PROBLEMS = {
     "dead load": ("hard-dead-load", {}, 0.002, {"displacement, m": lambda r: last(r, "middle.x")}),
     "stretch to 4 x, 49 per cell": ("hard-stretch", {"bodies": {"strip": {"particles_per_cell": 49}}}, 0.002, {
         "stretch": lambda r: 1 + last(r, "middle.x") / 1.5}),
-    "footing, slow": ("hard-footing-slow", {}, 0.02, {"load": lambda r: last(r, "load.y")}),
     "dam break, K = 2e7": ("hard-dam-break", {"time": {"end": 0.672}}, 0.0, {
         "front at 0.336 s, m": lambda r: at(r, "front", 0.336), "largest pressure at the end, Pa": lambda r: last(r, "pressure_max")}),
     "disk collision": ("disk-collision", {}, 0.002, {"energy left": energy_left}),

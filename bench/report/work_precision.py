@@ -83,7 +83,7 @@ def diagrams(data, problem):
                 for k, (name, rows) in enumerate(curves.items()):
                     style = ({"color": COLOURS[rows[0]["scheme"]], "linestyle": LINES[rows[0]["basis"]]} if line < 2
                              else {"color": f"C{k}"} if rows[0]["changed"] else {"color": COLOURS["anchored"], "linewidth": 2})  # fmt: skip
-                    axis.loglog([r[cost] for r in rows], [r["error"] for r in rows], marker=".", markersize=3, linewidth=0.9,
+                    axis.loglog([r[cost] for r in rows], [r["error"] for r in rows], marker=".", markersize=3,
                                 label=name.removeprefix("quadratic anchored, ") if line == 2 else name, **{"linewidth": 0.9, **style})  # fmt: skip
                 axis.set_xlabel(f"cost, {unit}")
                 if line == 0:

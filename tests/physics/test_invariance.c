@@ -23,6 +23,7 @@ static struct mpm_material_def materials[2];
 static struct mpm_body_def bodies[2];
 static struct mpm_wall_def walls[N_WALLS];
 static struct mpm_stage_def stage;
+static struct mpm_def def;
 
 // x' = scale (sign[d] x[axis[d]] + shift[d])
 struct view {
@@ -52,6 +53,22 @@ static void box(const struct view *w, const double *min, const double *max, doub
         to_min[d] = fmin(a[d], b[d]);
         to_max[d] = fmax(a[d], b[d]);
     }
+}
+
+// The scene after so many steps.
+static struct mpm_sim *stepped(int steps) {
+    struct mpm_sim *sim;
+    struct mpm_error err = {0};
+    if (mpm_create(&def, &sim, &err)) {
+        fail_msg("%s: %s", err.pointer, err.message);
+    }
+    for (int k = 0; k < steps; k++) {
+        if (mpm_step(sim, &err)) {
+            fail_msg("%s, basis %d, scheme %d: %s", def.dimension == 2 ? "2D" : "3D", def.basis,
+                     (int)def.settings.fbar.scheme, err.message);
+        }
+    }
+    return sim;
 }
 
 // Lengths and times scale alike, so speeds and stresses stay.
@@ -96,7 +113,7 @@ static struct mpm_sim *create(const struct view *w, int dim, int basis,
     }
     vector(w, slide, 1, walls[0].velocity);
     stage = (struct mpm_stage_def){.name = "main", .duration = 1000 * s};
-    struct mpm_def def = mpm_def_default();
+    def = mpm_def_default();
     def.dimension = dim;
     def.basis = (enum mpm_basis)basis;
     const double min[3] = {-1.5, -1.5, -1.5}, max[3] = {1.5, 1.5, 1.5}, g[3] = {1, -10, 0.5};
@@ -113,17 +130,7 @@ static struct mpm_sim *create(const struct view *w, int dim, int basis,
     def.walls = walls;
     def.stages = &stage;
     def.wants_displacement = true;
-    struct mpm_sim *sim;
-    struct mpm_error err = {0};
-    if (mpm_create(&def, &sim, &err)) {
-        fail_msg("%s: %s", err.pointer, err.message);
-    }
-    for (int k = 0; k < N_STEPS; k++) {
-        if (mpm_step(sim, &err)) {
-            fail_msg("%s", err.message);
-        }
-    }
-    return sim;
+    return stepped(N_STEPS);
 }
 
 struct state {
@@ -351,7 +358,7 @@ static struct state fly(const struct free_scene *f, int steps) {
         }
     }
     stage = (struct mpm_stage_def){.name = "main", .duration = 1000};
-    struct mpm_def def = mpm_def_default();
+    def = mpm_def_default();
     def.dimension = f->dim;
     def.basis = (enum mpm_basis)f->basis;
     for (int d = 0; d < f->dim; d++) {
@@ -368,18 +375,7 @@ static struct state fly(const struct free_scene *f, int steps) {
     def.bodies = bodies;
     def.stages = &stage;
     def.wants_displacement = true;
-    struct mpm_sim *sim;
-    struct mpm_error err = {0};
-    if (mpm_create(&def, &sim, &err)) {
-        fail_msg("%s: %s", err.pointer, err.message);
-    }
-    for (int k = 0; k < steps; k++) {
-        if (mpm_step(sim, &err)) {
-            fail_msg("%s, basis %d, scheme %d: %s", f->dim == 2 ? "2D" : "3D", f->basis,
-                     (int)f->fbar.scheme, err.message);
-        }
-    }
-    struct state raw = read_and_free(sim, f->dim), s = raw;
+    struct state raw = read_and_free(stepped(steps), f->dim), s = raw;
     const size_t all = n[0] + n[1], d = (size_t)f->dim;
     assert_int_equal(raw.n, all);
     s.x = malloc(all * (3 * d + d * d + 1) * sizeof *s.x);
