@@ -18,7 +18,7 @@
 
 bool guard_init(struct guard *guard, const char *bound, const char *token_file, char *why,
                 size_t why_bytes) {
-    char text[TOKEN_MAX + 1];
+    char text[TOKEN_MAX + 2];
     *guard = (struct guard){0};
     snprintf(guard->bound, sizeof guard->bound, "%s", bound);
     if (token_file == NULL || token_file[0] == '\0')
@@ -36,8 +36,12 @@ bool guard_init(struct guard *guard, const char *bound, const char *token_file, 
         fclose(file);
         return false;
     }
-    size_t n = fread(text, 1, TOKEN_MAX, file);
+    size_t n = fread(text, 1, TOKEN_MAX + 1, file);
     fclose(file);
+    if (n > TOKEN_MAX) {
+        snprintf(why, why_bytes, "%s: a token has at most %d characters", token_file, TOKEN_MAX);
+        return false;
+    }
     while (n > 0 && strchr(" \t\r\n", text[n - 1]) != NULL)
         n--;
     text[n] = '\0';

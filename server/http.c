@@ -36,6 +36,7 @@
 #define DRAIN_MAX ((uint64_t)1 << 30) // bytes of an unwanted body that are read before giving up
 #define STREAM_BLOCK (64 * 1024)
 #define TLS_FILE_MAX (1 << 20)
+#define TLS_PRIORITIES "NORMAL:-VERS-ALL:+VERS-TLS1.3:+VERS-TLS1.2" // RFC 8996: none before 1.2
 
 enum peer_stage {
     PEER_QUIET, // asks nothing, or has not finished asking
@@ -691,6 +692,7 @@ struct http_server *http_start(const struct http_address *address,
     struct MHD_OptionItem secure[] = {
         {MHD_OPTION_HTTPS_MEM_CERT, 0, server->cert},
         {MHD_OPTION_HTTPS_MEM_KEY, 0, server->key},
+        {MHD_OPTION_HTTPS_PRIORITIES, 0, (char *)(uintptr_t)TLS_PRIORITIES},
         {MHD_OPTION_END, 0, NULL},
     };
     struct MHD_OptionItem plain[] = {{MHD_OPTION_END, 0, NULL}};

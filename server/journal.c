@@ -255,6 +255,7 @@ int journal_remove(const char *data_dir, const char *id, char *why) {
     char path[PATH_MAX], away[PATH_MAX];
     snprintf(path, sizeof path, "%s/runs/%s", data_dir, id);
     snprintf(away, sizeof away, "%s/runs/.old-%s", data_dir, id);
+    remove_tree(away); // what could not be cleared last time
     if (rename(path, away) != 0 && errno != ENOENT) {
         journal_failure(errno, path, why);
         return -1;
@@ -282,8 +283,8 @@ struct journal *journal_create(const char *data_dir, const char *id, const char 
         journal_explain(why, "out of memory");
         return NULL;
     }
-    snprintf(j->folder, sizeof j->folder, "%s/runs/%s", data_dir, id);
     snprintf(building, sizeof building, "%s/runs/.new-%s", data_dir, id);
+    snprintf(j->folder, sizeof j->folder, "%s", building);
     remove_tree(building);
     if (mkdir(building, 0700) != 0) {
         journal_failure(errno, building, why);
@@ -294,18 +295,19 @@ struct journal *journal_create(const char *data_dir, const char *id, const char 
         snprintf(path, sizeof path, "%s/run.json", building) >= (int)sizeof path ||
         write_file(path, meta, strlen(meta), false, why) != JOURNAL_OK)
         goto fail;
+    // Whole before it has its name: what has failed is no run for the next daemon, even where there
+    // are no descriptors left to clear it away with.
+    if (!journal_events_open(j, why))
+        goto fail;
+    snprintf(j->folder, sizeof j->folder, "%s/runs/%s", data_dir, id);
     if (rename(building, j->folder) != 0) {
         journal_failure(errno, j->folder, why);
         goto fail;
     }
-    if (!journal_events_open(j, why)) {
-        remove_tree(j->folder);
-        goto fail;
-    }
     return j;
 fail:
+    journal_close(j); // first: to clear a folder takes a descriptor
     remove_tree(building);
-    journal_close(j);
     return NULL;
 }
 

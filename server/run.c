@@ -488,6 +488,7 @@ struct run *run_create(const struct run_host *host, const struct run_definition 
     if (!made || !begin_thread(r)) {
         slots_leave(host->slots, &r->slot);
         slots_unreserve(host->slots, &r->slot);
+        journal_rest(r->journal); // to clear its folder takes a descriptor
         journal_remove(host->data_dir, r->id, NULL);
         goto fail;
     }

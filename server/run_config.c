@@ -101,6 +101,14 @@ enum run_outcome run_configure(struct run *r, struct run_command *c) {
                  "after a restart the run is still repeating steps that were published");
         return RUN_BUSY;
     }
+    // Its state, which decides what is possible, is in a checkpoint that nobody has read yet.
+    if (r->sim == NULL && journal_n_frames(r->journal) > 0) {
+        snprintf(c->why, sizeof c->why,
+                 "after a restart the run waits for its slot before it goes on from step %llu: try "
+                 "again when it runs, or pause it first",
+                 (unsigned long long)r->now.step);
+        return RUN_BUSY;
+    }
     cJSON *patched = scene_config_patch(r->scene_json, c->patch, &next, &which, &end_changed,
                                         &output_changed, &c->faults);
     if (patched == NULL)

@@ -225,6 +225,28 @@ def test_patch_of_a_queued_run_holds_when_it_starts(daemon):
     daemon.away(third)
 
 
+def test_patch_of_a_run_that_waits_for_its_slot_after_a_restart(fresh):
+    """What is possible depends on where it stands, which is known once it is paused or runs."""
+    d = fresh(slots=2).start()
+    for run in ("a", "b"):
+        d.create(endless(output={"interval": 1.0}), id=run)
+        d.wait_step(run, 1500)
+    d.stop()
+    d.slots = 1
+    d.start()
+    waits = until(lambda: [r["id"] for r in d.get("/v1/runs")["runs"] if r["state"] == "queued"])[0]
+    reply = d.ask("PATCH", f"/v1/runs/{waits}/config", {"time": {"end": 0.5}}, status=503)
+    assert "pause it" in reply.json["detail"], reply
+    at = d.act(waits, "pause")
+    assert at["step"] >= 1500 and at["revision"] == 0, at
+    d.ask("PATCH", f"/v1/runs/{waits}/config", {"time": {"end": 0.5}}, status=422)  # in its past
+    d.patch(waits, {"time": {"end": at["time"] + 0.01}})
+    d.away("a" if waits == "b" else "b")
+    d.act(waits, "resume")
+    end = d.wait(waits, "completed")
+    assert (end["epoch"], end["revision"], end["step"] - at["step"]) == (0, 1, 10), end
+
+
 def test_patch_of_a_finished_run_is_409(daemon, name):
     daemon.create(water(time={"end": 0.005}), id=name)
     daemon.wait(name, "completed")

@@ -14,6 +14,7 @@ import stat
 import subprocess
 import threading
 import time
+import warnings
 
 import pytest
 from boxes import big, endless, merged, water
@@ -151,6 +152,12 @@ def test_missing_or_empty_token_file_is_refused(tmp_path):
     refused(*FREE, "--data-dir", tmp_path / "d", "--token-file", tmp_path / "empty")
 
 
+def test_token_that_is_too_long_is_refused_and_not_cut(tmp_path):
+    (tmp_path / "token").write_text("a" * 4097)
+    (tmp_path / "token").chmod(0o600)
+    assert "4096" in refused(*FREE, "--data-dir", tmp_path / "d", "--token-file", tmp_path / "token")
+
+
 def test_token_file_that_others_can_read_is_refused(tmp_path):
     (tmp_path / "token").write_text("secret\n")
     for mode in (0o644, 0o640, 0o604):
@@ -214,6 +221,21 @@ def test_tls_serves_https(tmp_path):
         answer = connection.getresponse()
         assert (answer.status, json.loads(answer.read())) == (200, {"runs": []})
         connection.close()
+        # RFC 8996: no TLS before 1.2. SECLEVEL=0, so that it is not this side that refuses.
+        for version, taken in ((ssl.TLSVersion.TLSv1_1, False), (ssl.TLSVersion.TLSv1_2, True)):
+            context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+            context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
+            context.set_ciphers("ALL:@SECLEVEL=0")
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", DeprecationWarning)
+                context.minimum_version = context.maximum_version = version
+            host, port = d.host.split(":")
+            with socket.create_connection((host, int(port)), timeout=60) as plain:
+                if taken:
+                    context.wrap_socket(plain).close()
+                else:
+                    with pytest.raises((ssl.SSLError, ConnectionError)):
+                        context.wrap_socket(plain)
     finally:
         d.stop()
 
@@ -642,6 +664,21 @@ def test_few_descriptors_are_no_way_to_lock_others_out(fresh):
         for s in idle:
             s.close()
     assert not d.run(run)["warnings"]
+
+
+def test_what_was_refused_for_want_of_descriptors_is_no_run_after_a_restart(fresh):
+    d = fresh()
+    d.limits = {resource.RLIMIT_NOFILE: 32}
+    d.start()
+    body = {"scene": endless(), "start": False}
+    answers = {f"r{k}": d.request("POST", "/v1/runs", {"id": f"r{k}", **body}).status for k in range(30)}
+    assert set(answers.values()) == {201, 507}, answers
+    made = {run for run, status in answers.items() if status == 201}
+    d.stop()
+    d.limits = {}
+    d.start()
+    assert {run["id"] for run in d.get("/v1/runs")["runs"]} == made
+    d.create(endless(), id=next(run for run in answers if run not in made))
 
 
 @pytest.mark.skipif(is_sanitized(), reason="sanitizers take terabytes of address space")
