@@ -112,7 +112,7 @@ def main():
     wanted = list(cases([2] if options.quick else [2, 3], BASES, SCHEMES, materials))
     if not options.quick:  # many particles: uGIMP bears the less the more there are
         for n in (7, 10):
-            wanted += cases([2], BASES[1:], ["standard"], ["elastic, nu = 0.3", "viscous fluid"], n)
+            wanted += cases([2], BASES[1:], ["standard", "anchored"], ["elastic, nu = 0.3", "viscous fluid"], n)
         wanted += cases([3], ["gimp"], ["standard"], ["elastic, nu = 0.3"], 5)
     store = Store(options.output / "points.jsonl")
     ask_limits(wanted)

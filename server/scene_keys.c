@@ -628,7 +628,7 @@ static const struct scene_key root_keys[] = {
      .required = true,
      .doc = "where particles may be; no wall, a particle that leaves it fails the run"},
     {"cell", POSITIVE("m"), .required = true, .doc = "cell size h of the background grid"},
-    {"basis", CHOICE(basis), .fallback = "\"gimp\"", .doc = "basis functions of the grid"},
+    {"basis", CHOICE(basis), .fallback = "\"bspline2\"", .doc = "basis functions of the grid"},
     {"transfer", TRANSFER, .fallback = "{}", .doc = "between particles and grid"},
     {"fbar", EITHER(fbar_forms), .live = true, .fallback = "false",
      .doc = "F-bar against volumetric locking; `true` is `{\"scheme\": \"zhao\"}`"},

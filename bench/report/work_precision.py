@@ -166,26 +166,37 @@ def advice(data):
         logs = [math.log(x) for x in (ratio(data, *k, lambda r: r["changed"] == changed and all(r[f] == v for f, v in wanted.items())) for k in measures) if x]
         return math.exp(sum(logs) / len(logs)) if logs else math.nan
 
-    smooth = [math.log(x) for p, m in locking for x in [compare_smooth(data, p)] if x]
-    texts = [
-        f"For pressure in nearly incompressible matter switch F̄ on: without it the pressure error is {typical(locking, basis='gimp', scheme='standard'):.0f} "
+    def factor(measures, name, value, of="error"):
+        logs = [math.log(x) for x in (ratio(data, *k, lambda r: (r["basis"], r["scheme"], r["changed"]) == ("bspline2", "anchored", [name])
+                                            and float(r[name]) == value, of) for k in measures) if x]  # fmt: skip
+        return math.exp(sum(logs) / len(logs)) if logs else math.nan
+
+    def smooth(scheme):
+        found = [(p, compare_smooth(data, p, scheme)) for p, m in data.measures() if m == "pressure, smooth"]
+        return ", ".join(f"{p} {x:.2f}" for p, x in found if x)
+
+    uniform = ratio(data, "cylinder", "pressure", lambda r: (r["basis"], r["scheme"], r["changed"]) == ("bspline2", "zhao", []))
+    return [
+        f"<b>F̄ on</b> for pressure in nearly incompressible matter: without it the pressure error is {typical(locking, basis='gimp', scheme='standard'):.0f} "
         f"(uGIMP), {typical(locking, basis='bspline2', scheme='standard'):.1f} (quadratic), {typical(locking, basis='bspline3', scheme='standard'):.1f} "
         "(cubic) times that of the default.",
-        f"anchored or zhao: at the end times of these problems zhao's pressure error is {typical(locking, basis='bspline2', scheme='zhao'):.2f} and its error of "
-        f"motion {typical(motions, basis='bspline2', scheme='zhao'):.2f} times that of anchored (quadratic B-splines); and it grows with time (creep, below).",
-        f"Quadratic B-splines rather than uGIMP (error of motion {typical(motions, basis='gimp', scheme='anchored'):.2f}, of pressure "
-        f"{typical(locking, basis='gimp', scheme='anchored'):.2f} times), cubic ones ({typical(motions, basis='bspline3', scheme='anchored'):.2f}, "
-        f"{typical(locking, basis='bspline3', scheme='anchored'):.2f}) where a smooth field is worth their cost.",
+        f"<b>anchored</b>: zhao's pressure error is {typical(locking, basis='bspline2', scheme='zhao'):.2f} and its error of motion "
+        f"{typical(motions, basis='bspline2', scheme='zhao'):.2f} times that of anchored (quadratic), at the end times of these problems, and grows with time (creep, "
+        f"below); a uniform pressure (cylinder) is zhao's: {uniform or math.nan:.2f} times.",
+        f"<b>Quadratic B-splines</b>: uGIMP has {typical(motions, basis='gimp', scheme='anchored'):.2f} times the error of motion and {typical(locking, basis='gimp', scheme='anchored'):.2f} "
+        f"times that of pressure for the same cost, cubic ones {typical(motions, basis='bspline3', scheme='anchored'):.2f} and {typical(locking, basis='bspline3', scheme='anchored'):.2f} times.",
+        f"<b>CFL 0.5</b> instead of 0.3 makes errors {factor(motions, 'cfl', 0.5):.2f} (motion) and {factor(pressures, 'cfl', 0.5):.2f} (pressure) times as large for "
+        f"{factor(pressures, 'cfl', 0.5, 'cpu_s'):.2f} of the cost; B-splines bear it (method.md, section 7), uGIMP only in 2D with up to 4 particles a cell, so 0.3 "
+        "stays what a scene gets that says nothing.",
+        f"<b>FLIP</b>: a blend of 0.99 makes the error of motion {factor(motions, 'blend', 0.99):.2f} times as large, PIC {factor(motions, 'blend', 0):.1f} times.",
+        "<b>mean_stress_smooth</b> for looking at pressure. Its error over that of mean_stress, quadratic: anchored " + smooth("anchored") + "; without F̄ " + smooth("standard")
+        + ". It helps where noise rules, and not where the field changes within two cells (vortex) or where the last digit at a wall counts (column).",
     ]
-    if smooth:
-        texts.append(f"To look at pressure, take the field mean_stress_smooth: its error is {math.exp(sum(smooth) / len(smooth)):.2f} times that of mean_stress "
-                     "(quadratic, anchored; not where the field itself changes within two cells, as in the vortex, or to the last digit at a wall, as in the column).")  # fmt: skip
-    return texts
 
 
-def compare_smooth(data, problem):
-    raw = {r["cell"]: r["error"] for r in data.of(problem, "pressure", basis="bspline2", scheme="anchored") if not r["changed"]}
-    logs = [math.log(r["error"] / raw[r["cell"]]) for r in data.of(problem, "pressure, smooth", basis="bspline2", scheme="anchored")
+def compare_smooth(data, problem, scheme):
+    raw = {r["cell"]: r["error"] for r in data.of(problem, "pressure", basis="bspline2", scheme=scheme) if not r["changed"]}
+    logs = [math.log(r["error"] / raw[r["cell"]]) for r in data.of(problem, "pressure, smooth", basis="bspline2", scheme=scheme)
             if not r["changed"] and raw.get(r["cell"])]  # fmt: skip
     return math.exp(sum(logs) / len(logs)) if logs else None
 

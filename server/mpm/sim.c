@@ -17,7 +17,7 @@ struct mpm_settings mpm_settings_default(void) {
 
 struct mpm_def mpm_def_default(void) {
     return (struct mpm_def){
-        .dimension = 2, .basis = MPM_GIMP, .settings = mpm_settings_default(), .n_threads = 1};
+        .dimension = 2, .basis = MPM_BSPLINE2, .settings = mpm_settings_default(), .n_threads = 1};
 }
 
 const struct mpm_material_def *mpm_material_of(const struct mpm_def *def, int material,

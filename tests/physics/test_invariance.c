@@ -219,10 +219,15 @@ static void compare(const struct view *w, int dim, int basis, enum mpm_fbar_sche
 }
 
 // In 3D the linear basis does not bear it: nodes that a particle just reaches are thrown away.
+// There `make check` takes quadratic B-splines, `make check-long` all others too.
+static bool is_tried(int dim, int basis) {
+    return dim == 2 || basis == MPM_BSPLINE2 || (basis != MPM_LINEAR && getenv("FBARD_LONG"));
+}
 #define FOR_CASES(dim, basis, scheme)                                                              \
-    for (int dim = 2; dim <= (getenv("FBARD_LONG") ? 3 : 2); dim++)                                \
-        for (int basis = dim == 2 ? 0 : MPM_GIMP; basis < MPM_N_BASES; basis++)                    \
-            for (enum mpm_fbar_scheme scheme = MPM_FBAR_OFF; scheme < MPM_N_FBAR_SCHEMES; scheme++)
+    for (int dim = 2; dim <= 3; dim++)                                                             \
+        for (int basis = 0; basis < MPM_N_BASES; basis++)                                          \
+            for (enum mpm_fbar_scheme scheme = MPM_FBAR_OFF;                                       \
+                 is_tried(dim, basis) && scheme < MPM_N_FBAR_SCHEMES; scheme++)
 
 static void test_invariance_under_reflection(void **state) {
     (void)state;
@@ -280,11 +285,16 @@ static void test_invariance_under_scaling_is_exact(void **state) {
     }
 }
 
-// ---- Bodies that fly free: renumbered, and seen from a frame that moves ---------------------------
+// ---- Bodies that fly free: renumbered, and seen from a frame that moves
+// ---------------------------
 
-// A disk of rubber that turns to where a disk of clay waits, without walls. Given by points, so that their
-// order can be chosen; `speed` in cells a step, along every axis.
+// A disk of rubber that turns to where a disk of clay waits, without walls. Given by points, so
+// that their order can be chosen; `speed` in cells a step, along every axis, in 3D along x (the
+// grid that all axes would need in 1,000 steps is more than the solver takes).
 #define N_FREE 2
+static int n_moving(int dim) {
+    return dim == 3 ? 1 : dim;
+}
 struct free_scene {
     int dim, basis;
     struct mpm_fbar fbar;
@@ -347,14 +357,14 @@ static struct state fly(const struct free_scene *f, int steps) {
             turn_round(points[b], n[b], width);
         }
         const int at = f->bodies_swapped ? 1 - b : b;
-        bodies[at] = (struct mpm_body_def){.name = b ? "clay" : "rubber",
-                                           .material = b,
-                                           .particles_per_direction = 2};
+        bodies[at] = (struct mpm_body_def){
+            .name = b ? "clay" : "rubber", .material = b, .particles_per_direction = 2};
         bodies[at].shape.kind = MPM_SHAPE_POINTS;
         bodies[at].shape.points = points[b];
         bodies[at].shape.n_points = n[b];
         for (int d = 0; d < f->dim; d++) {
-            bodies[at].velocity.vector[d] = f->speed * H / dt + (b == 0 && d == 0 ? 2 : 0);
+            const double speed = d < n_moving(f->dim) ? f->speed * H / dt : 0;
+            bodies[at].velocity.vector[d] = speed + (b == 0 && d == 0 ? 2 : 0);
         }
     }
     stage = (struct mpm_stage_def){.name = "main", .duration = 1000};
@@ -363,7 +373,7 @@ static struct state fly(const struct free_scene *f, int steps) {
     def.basis = (enum mpm_basis)f->basis;
     for (int d = 0; d < f->dim; d++) {
         def.domain_min[d] = -8;
-        def.domain_max[d] = 8 + f->speed * H * steps;
+        def.domain_max[d] = 8 + (d < n_moving(f->dim) ? f->speed * H * steps : 0);
     }
     def.cell = H;
     def.settings.dt = dt;
@@ -397,14 +407,17 @@ static struct state fly(const struct free_scene *f, int steps) {
     return s;
 }
 
-// `shift` m and `speed` m/s on every axis; positions and velocities are known to the round-off of these.
+// `shift` m and `speed` m/s on every axis that moves; positions and velocities are known to the
+// round-off of these.
 static void compare_free(const struct state *a, const struct state *b, int dim, double shift,
                          double speed) {
-    const double rounded = 4 * DBL_EPSILON * N_STEPS * speed; // some roundings of a speed of that size a step
+    const double rounded =
+        4 * DBL_EPSILON * N_STEPS * speed; // some roundings of a speed of that size a step
     double pressed = 0;
     for (size_t i = 0; i < a->n * (size_t)dim; i++) {
-        near(b->u[i] - shift, a->u[i], TOL, "displacement");
-        near(b->v[i] - speed, a->v[i], 10 * TOL + rounded, "velocity");
+        const bool moves = i % (size_t)dim < (size_t)n_moving(dim);
+        near(b->u[i] - (moves ? shift : 0), a->u[i], TOL, "displacement");
+        near(b->v[i] - (moves ? speed : 0), a->v[i], 10 * TOL + rounded, "velocity");
     }
     for (size_t i = 0; i < a->n * (size_t)(dim * dim); i++) {
         near(b->stress[i], a->stress[i], 1e6 * TOL, "stress");
@@ -416,8 +429,8 @@ static void compare_free(const struct state *a, const struct state *b, int dim, 
     assert_true(pressed > 1e3); // they have met
 }
 
-// Each node's sum is taken in the order of the particles within their cells, so other numbers give other
-// round-off, and no more than that.
+// Each node's sum is taken in the order of the particles within their cells, so other numbers give
+// other round-off, and no more than that.
 static void test_invariance_under_renumbering(void **state) {
     (void)state;
     FOR_CASES(dim, basis, scheme) {
@@ -435,9 +448,10 @@ static void test_invariance_under_renumbering(void **state) {
     }
 }
 
-// On a fixed grid a moving frame sees other weights, so motion is Galilean to the order of the method
-// only; but for a frame that moves by a whole cell a step, which sees the same ones. The anchored F-bar
-// forgets with travel over the grid (C), which is no motion of the matter: it is Galilean with C = 0.
+// On a fixed grid a moving frame sees other weights, so motion is Galilean to the order of the
+// method only; but for a frame that moves by a whole cell a step, which sees the same ones. The
+// anchored F-bar forgets with travel over the grid (C), which is no motion of the matter: it is
+// Galilean with C = 0.
 static void test_invariance_in_a_moving_frame(void **state) {
     (void)state;
     FOR_CASES(dim, basis, scheme) {

@@ -1269,7 +1269,7 @@ static void test_scene_as_run_has_every_default(void **state) {
     for (const struct scene_key *key = scene_root.keys; key->name; key++)
         if (!json_member(json, key->name))
             fail_msg("%s is not filled in", key->name);
-    assert_string_equal(json_member(json, "basis")->valuestring, "gimp");
+    assert_string_equal(json_member(json, "basis")->valuestring, "bspline2");
     assert_true(json_member(json_member(json, "time"), "cfl")->valuedouble == 0.3);
     assert_null(json_member(json_member(json, "time"), "dt"));
     assert_true(json_member(json_member(json_member(json, "materials"), "water"), "viscosity")

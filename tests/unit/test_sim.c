@@ -86,6 +86,7 @@ static void define(int dim, int kind) {
     };
     memset(&world, 0, sizeof world);
     world.def = mpm_def_default();
+    world.def.basis = MPM_GIMP;
     for (int k = 0; k < 2; k++) {
         world.materials[k] = materials[kind];
         world.materials[k].fbar = true;
