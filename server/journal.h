@@ -77,6 +77,8 @@ enum journal_result journal_replace(struct journal *journal, const char *name, c
 // Appends `json` (an object, no newline in it); it survives kill -9 once this returns.
 enum journal_result journal_append_event(struct journal *journal, const char *json, char *why);
 uint64_t journal_n_events(struct journal *journal); // lines in the log
+// Keeps room on the disk for a line of so many bytes, so that one that must not fail can be written.
+enum journal_result journal_events_room(struct journal *journal, size_t bytes, char *why);
 // The line that begins at `*offset` (0: the first), without its check, which the caller frees;
 // moves the offset to the next one. NULL when there is none yet. May be called from any thread.
 char *journal_event_next(struct journal *journal, uint64_t *offset);

@@ -89,6 +89,19 @@ enum journal_result journal_append_event(struct journal *j, const char *json, ch
     return JOURNAL_OK;
 }
 
+enum journal_result journal_events_room(struct journal *j, size_t bytes, char *why) {
+    int error = 0;
+    if (journal_vanished(j->events))
+        error = ENOENT;
+    else if (fallocate(j->events, FALLOC_FL_KEEP_SIZE, (off_t)j->event_bytes,
+                       (off_t)(bytes + CHECK_BYTES + 2)) != 0)
+        error = errno;
+    // A file system that cannot promise room is asked as the line is written.
+    return error == 0 || error == EOPNOTSUPP || error == ENOSYS
+               ? JOURNAL_OK
+               : journal_failure(error, j->folder, why);
+}
+
 uint64_t journal_n_events(struct journal *j) {
     pthread_mutex_lock(&j->lock);
     uint64_t n = j->n_events;

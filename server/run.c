@@ -653,6 +653,9 @@ static bool restore_live(struct run *r, enum run_restore how) {
     bool has_status = restore_status(r);
     restore_changes(r);
     restore_series(r);
+    if (r->sim_bytes > r->host->memory_limit)
+        run_warn(&r->now, "cannot go on here: it needs %zu bytes of memory, this daemon gives %zu",
+                 r->sim_bytes, r->host->memory_limit);
     if (is_over(r, has_status)) {
         restore_final(r,
                       has_status && run_state_is_final(r->now.state) ? r->now.state : RUN_CANCELLED,

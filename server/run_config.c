@@ -7,7 +7,8 @@
 #include "server/log.h"
 #include "server/run_inside.h"
 
-#define STEPS_MAX 1e15 // as of a new run: beyond it doubles soon no longer count one by one
+#define STEPS_MAX 1e15  // as of a new run: beyond it doubles soon no longer count one by one
+#define EVENT_BYTES 256 // of an event in the log but for its patch: names, date, five numbers
 
 // ---- Changes of the configuration -------------------------------------------------------------
 
@@ -116,6 +117,15 @@ enum run_outcome run_configure(struct run *r, struct run_command *c) {
     if (same_json(patched, r->scene_json)) {
         cJSON_Delete(patched);
         return RUN_DONE;
+    }
+    // A change that is made but not logged could not be made again after a crash, and it cannot be
+    // taken back to the last bit: a disk without room refuses it before it is made.
+    char *patch = json_print(c->patch, false);
+    size_t bytes = (patch != NULL ? strlen(patch) : 0) + EVENT_BYTES;
+    free(patch);
+    if (journal_events_room(r->journal, bytes, c->why) != JOURNAL_OK) {
+        cJSON_Delete(patched);
+        return RUN_STORAGE;
     }
     if (r->sim != NULL) {
         if (!change_apply(r, &next, which, end_changed, &c->faults)) {

@@ -612,6 +612,37 @@ def test_a_full_disk_is_warned_of_while_it_is_full(tmp_path):
         subprocess.run(["umount", "-l", tmp_path])
 
 
+def test_a_change_that_a_full_disk_refuses_leaves_the_run_as_it_was(tmp_path):
+    """And not failed: a change that could not be logged must not have been made."""
+    if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=4m", "tmpfs", tmp_path], capture_output=True).returncode:
+        pytest.skip("cannot mount a small tmpfs here")
+    try:
+        d = Daemon(tmp_path).start()
+        try:
+            for run, start in (("runs", True), ("paused", False)):
+                d.create(endless(), id=run, start=start)
+            until(lambda: d.frames("runs") and d.frames("paused"))
+            fill = tmp_path / "fill"
+            subprocess.run(["dd", "if=/dev/zero", f"of={fill}", "bs=4k"], capture_output=True)
+            for run, state in (("runs", "running"), ("paused", "paused")):
+                made = 0  # as many as what is left of the log's last page holds
+                while (reply := d.request("PATCH", f"/v1/runs/{run}/config",
+                                          {"gravity": [1e-9 * (made + 1), 0]})).status == 200:  # fmt: skip
+                    made += 1
+                assert reply.status == 507 and "No space" in reply.json["detail"], reply
+                now = d.run(run)
+                assert (now["state"], now["revision"], now["error"]) == (state, made, None), now
+                assert d.get(f"/v1/runs/{run}/config")["gravity"] == [1e-9 * made, 0]
+            fill.unlink()
+            for run in ("runs", "paused"):
+                d.patch(run, {"gravity": [1, 0]})
+            d.away("runs", "paused")
+        finally:
+            d.stop()
+    finally:
+        subprocess.run(["umount", "-l", tmp_path])
+
+
 # ---- Scarcity ----
 
 TINY = water(time={"end": 0.002}, output={"interval": 0.001})
@@ -679,6 +710,21 @@ def test_what_was_refused_for_want_of_descriptors_is_no_run_after_a_restart(fres
     d.start()
     assert {run["id"] for run in d.get("/v1/runs")["runs"]} == made
     d.create(endless(), id=next(run for run in answers if run not in made))
+
+
+def test_run_that_no_longer_fits_says_why_it_is_queued(fresh):
+    d = fresh().start()
+    d.create(TINY, id="large", start=False)
+    d.stop()
+    d.options = ("--memory-limit", "1000")
+    d.start()
+    now = d.act("large", "start")
+    assert now["state"] == "queued", now
+    assert [w for w in now["warnings"] if "bytes of memory, this daemon gives 1000" in w], now
+    d.stop()
+    d.options = ()
+    d.start()
+    assert not d.wait("large", "completed")["warnings"]
 
 
 @pytest.mark.skipif(is_sanitized(), reason="sanitizers take terabytes of address space")
