@@ -377,14 +377,25 @@ MPM_KERNEL mpm_vec mpm_load_upper(const double *from) {
     return _mm256_load_pd(from);
 #endif
 }
-// All lanes from `lane` on.
-MPM_KERNEL mpm_mask mpm_from_lane(int lane) {
+// All lanes from `lane` on, and *one in the lanes before, *other in these: a masked broadcast where
+// there is one.
 #if MPM_LANES == 8
-    return (mpm_mask)_mm512_movm_epi64((__mmask8)(0xffu << lane));
-#else
-    return (mpm_mask)mpm_lane_range(lane, 4);
-#endif
+typedef __mmask8 mpm_tail;
+MPM_KERNEL mpm_tail mpm_tail_from(int lane) {
+    return (mpm_tail)(0xffu << lane);
 }
+MPM_KERNEL mpm_vec mpm_splat_tail(const double *one, const double *other, mpm_tail tail) {
+    return _mm512_mask_broadcastsd_pd(_mm512_set1_pd(*one), tail, _mm_load_sd(other));
+}
+#else
+typedef mpm_mask mpm_tail;
+MPM_KERNEL mpm_tail mpm_tail_from(int lane) {
+    return (mpm_tail)mpm_lane_range(lane, 4);
+}
+MPM_KERNEL mpm_vec mpm_splat_tail(const double *one, const double *other, mpm_tail tail) {
+    return mpm_select(tail, mpm_splat(*other), mpm_splat(*one));
+}
+#endif
 // from[0], from[0], from[1], from[1], ...
 MPM_KERNEL mpm_vec mpm_load_twice(const double *from) {
 #if MPM_LANES == 8

@@ -216,16 +216,16 @@ MPM_KERNEL void find_nodes(struct batch *b, const struct mpm_grid *grid, const i
 
 // The value of one component at a node, for lanes of two cells: of the first cell's node, but of the
 // second's where `second`.
-MPM_KERNEL mpm_vec node_value(const double *one, const double *other, mpm_mask second,
+MPM_KERNEL mpm_vec node_value(const double *one, const double *other, mpm_tail second,
                               const bool two) {
-    return two ? mpm_select(second, mpm_splat(*other), mpm_splat(*one)) : mpm_splat(*one);
+    return two ? mpm_splat_tail(one, other, second) : mpm_splat(*one);
 }
 
 // eqs. 11, 12, 16: v^{n+1}, its increment and its gradient (per cell) at the particles of one
 // vector, whose cells' nodes are given: of one cell, or of two.
 MPM_KERNEL void gather_velocity_at(const struct batch *b, int lane,
                                    const struct mpm_particles *s, const double *velocity,
-                                   const uint32_t *nodes, const uint32_t *others, mpm_mask second,
+                                   const uint32_t *nodes, const uint32_t *others, mpm_tail second,
                                    const bool two, mpm_vec *out, const int dim,
                                    const enum mpm_basis basis) {
     const int support = mpm_support(basis), last = dim - 1, planes = dim == 3 ? support : 1;
@@ -238,35 +238,42 @@ MPM_KERNEL void gather_velocity_at(const struct batch *b, int lane,
     UNROLL for (int k = 0; k < 2 * dim + dim * dim; k++) {
         out[k] = mpm_splat(0);
     }
-    UNROLL_2D for (int a = 0; a < support; a++) {
-        const mpm_vec wa = w[0][a], dwa = dw[0][a];
-        UNROLL for (int p = 0; p < planes; p++) {
-            const int row = (dim == 3 ? a * support + p : a) * support;
-            mpm_vec v_w[3], v_dw[3], dv_w[3]; // sums along the row
-            UNROLL for (int c = 0; c < support; c++) {
-                const double *one = velocity + (size_t)nodes[row + c] * MPM_VELOCITY(dim);
-                const double *other =
-                    two ? velocity + (size_t)others[row + c] * MPM_VELOCITY(dim) : one;
-                UNROLL for (int d = 0; d < dim; d++) {
-                    const mpm_vec of = node_value(one + d, other + d, second, two);
-                    v_w[d] = c == 0 ? w_last[c] * of : v_w[d] + w_last[c] * of;
-                    v_dw[d] = c == 0 ? dw_last[c] * of : v_dw[d] + dw_last[c] * of;
-                    const mpm_vec change = node_value(one + dim + d, other + dim + d, second, two);
-                    dv_w[d] = c == 0 ? w_last[c] * change : dv_w[d] + w_last[c] * change;
+    // In 3D with 16 registers one component after the other, so that its sums stay in them.
+    const int at_once = MPM_LANES == 8 || dim == 2 ? dim : 1;
+    UNROLL for (int first = 0; first < dim; first += at_once) {
+        UNROLL_2D for (int a = 0; a < support; a++) {
+            const mpm_vec wa = w[0][a], dwa = dw[0][a];
+            UNROLL for (int p = 0; p < planes; p++) {
+                const int row = (dim == 3 ? a * support + p : a) * support;
+                mpm_vec v_w[3], v_dw[3], dv_w[3]; // sums along the row
+                UNROLL for (int c = 0; c < support; c++) {
+                    const double *one =
+                        velocity + (size_t)nodes[row + c] * MPM_VELOCITY(dim) + first;
+                    const double *other =
+                        two ? velocity + (size_t)others[row + c] * MPM_VELOCITY(dim) + first : one;
+                    UNROLL for (int d = 0; d < at_once; d++) {
+                        const mpm_vec of = node_value(one + d, other + d, second, two);
+                        v_w[d] = c == 0 ? w_last[c] * of : v_w[d] + w_last[c] * of;
+                        v_dw[d] = c == 0 ? dw_last[c] * of : v_dw[d] + dw_last[c] * of;
+                        const mpm_vec change =
+                            node_value(one + dim + d, other + dim + d, second, two);
+                        dv_w[d] = c == 0 ? w_last[c] * change : dv_w[d] + w_last[c] * change;
+                    }
                 }
-            }
-            mpm_vec w_row = wa, dw_row[2] = {dwa, dwa};
-            if (dim == 3) {
-                w_row = wa * w[1][p];
-                dw_row[0] = dwa * w[1][p];
-                dw_row[1] = wa * dw[1][p];
-            }
-            UNROLL for (int d = 0; d < dim; d++) {
-                v[d] += w_row * v_w[d];
-                dv[d] += w_row * dv_w[d];
-                l[d * dim + last] += w_row * v_dw[d];
-                UNROLL for (int e = 0; e < last; e++) {
-                    l[d * dim + e] += dw_row[e] * v_w[d];
+                mpm_vec w_row = wa, dw_row[2] = {dwa, dwa};
+                if (dim == 3) {
+                    w_row = wa * w[1][p];
+                    dw_row[0] = dwa * w[1][p];
+                    dw_row[1] = wa * dw[1][p];
+                }
+                UNROLL for (int d = 0; d < at_once; d++) {
+                    mpm_vec *l_d = l + (first + d) * dim;
+                    v[first + d] += w_row * v_w[d];
+                    dv[first + d] += w_row * dv_w[d];
+                    l_d[last] += w_row * v_dw[d];
+                    UNROLL for (int e = 0; e < last; e++) {
+                        l_d[e] += dw_row[e] * v_w[d];
+                    }
                 }
             }
         }
@@ -276,7 +283,7 @@ MPM_KERNEL void gather_velocity_at(const struct batch *b, int lane,
 // eq. 20: the averages at the particles of one vector.
 MPM_KERNEL void gather_ratios_at(const struct batch *b, int lane, const struct mpm_particles *s,
                                  const double *fbar,
-                                 const uint32_t *nodes, const uint32_t *others, mpm_mask second,
+                                 const uint32_t *nodes, const uint32_t *others, mpm_tail second,
                                  const bool two, mpm_vec *sum, const int dim,
                                  const enum mpm_basis basis, const int scalars) {
     const int support = mpm_support(basis), last = dim - 1, planes = dim == 3 ? support : 1;
@@ -310,7 +317,7 @@ MPM_KERNEL void gather_ratios_at(const struct batch *b, int lane, const struct m
 
 // What is gathered: velocities (scalars = 0), or F-bar's averages.
 MPM_KERNEL void gather_at(const struct batch *b, int lane, const struct mpm_particles *s,
-                          const struct mpm_grid *g, const uint32_t *nodes, const uint32_t *others, mpm_mask second,
+                          const struct mpm_grid *g, const uint32_t *nodes, const uint32_t *others, mpm_tail second,
                           const bool two, mpm_vec *out, const int dim, const enum mpm_basis basis,
                           const int scalars) {
     if (scalars == 0) {
@@ -340,10 +347,10 @@ MPM_KERNEL void gather(struct batch *b, const struct mpm_span *span, const int d
             mpm_vec out[6 + 9];
             const int next = run + 1 < b->n_runs ? b->run[run + 1] - lane : MPM_LANES;
             if (next >= MPM_LANES) {
-                gather_at(b, lane, s, g, b->nodes[run], b->nodes[run], mpm_from_lane(MPM_LANES),
+                gather_at(b, lane, s, g, b->nodes[run], b->nodes[run], mpm_tail_from(MPM_LANES),
                           false, out, dim, basis, scalars);
             } else {
-                gather_at(b, lane, s, g, b->nodes[run], b->nodes[run + 1], mpm_from_lane(next), true,
+                gather_at(b, lane, s, g, b->nodes[run], b->nodes[run + 1], mpm_tail_from(next), true,
                           out, dim, basis, scalars);
                 run++;
             }
@@ -414,10 +421,23 @@ MPM_KERNEL void scatter_part(const struct batch *b, double *node, const uint32_t
     }
 }
 
+// The next run's cell is the next one along the last direction: all but the first of its columns
+// are there already.
+MPM_KERNEL bool next_shares(const struct batch *b, int r) {
+    return r + 1 < b->n_runs && b->key[r + 1] == b->key[r] + 1 &&
+           (b->key[r] & (MPM_EDGE - 1)) != MPM_EDGE - 1;
+}
+
+MPM_KERNEL void add_to_node(double *node, uint32_t i, mpm_vec sum, const int part) {
+    double *to = node + (size_t)i * MPM_NODE + part * MPM_LANES;
+    mpm_store_aligned(to, mpm_load_aligned(to) + mpm_join_pairs(sum, part));
+}
+
 // The same in 2D, where the records have room for both directions of the gradient side by side, so
-// that a node takes one multiplication: the sums of both meet when the run is over.
-MPM_KERNEL void scatter_part_2d(const struct batch *b, double *node, const uint32_t *nodes,
-                                int begin, int end, const int part, const enum mpm_basis basis) {
+// that a node takes one multiplication: the sums of both meet when no more comes to a node. The
+// sums that the next run goes on with stay in registers.
+MPM_KERNEL void scatter_part_2d(const struct batch *b, double *node, const int part,
+                                const enum mpm_basis basis) {
     const int support = mpm_support(basis), at = part * MPM_LANES;
     mpm_vec sum[MPM_MAX_SUPPORT][MPM_MAX_SUPPORT];
     UNROLL for (int i = 0; i < support; i++) {
@@ -425,36 +445,51 @@ MPM_KERNEL void scatter_part_2d(const struct batch *b, double *node, const uint3
             sum[i][c] = mpm_splat(0);
         }
     }
-    for (int p = begin; p < end; p++) {
-        const mpm_vec own = mpm_load_aligned(b->record[p] + at);
-        mpm_vec R[MPM_MAX_SUPPORT], B[MPM_MAX_SUPPORT];
-        UNROLL for (int i = 0; i < support; i++) {
-            R[i] = own * mpm_splat_two(b->w[0][i] + p, b->dw[0][i] + p, 4, part);
-            B[i] = mpm_splat_two(b->w[1][i] + p, b->dw[1][i] + p, 6, part);
-        }
-        UNROLL for (int i = 0; i < support; i++) {
-            UNROLL for (int c = 0; c < support; c++) {
-                sum[i][c] += R[i] * B[c];
+    const int n_runs = b->n_runs;
+    for (int r = 0; r < n_runs; r++) {
+        for (int p = b->run[r]; p < b->run[r + 1]; p++) {
+            const mpm_vec own = mpm_load_aligned(b->record[p] + at);
+            mpm_vec R[MPM_MAX_SUPPORT], B[MPM_MAX_SUPPORT];
+            UNROLL for (int i = 0; i < support; i++) {
+                R[i] = own * mpm_splat_two(b->w[0][i] + p, b->dw[0][i] + p, 4, part);
+                B[i] = mpm_splat_two(b->w[1][i] + p, b->dw[1][i] + p, 6, part);
+            }
+            UNROLL for (int i = 0; i < support; i++) {
+                UNROLL for (int c = 0; c < support; c++) {
+                    sum[i][c] += R[i] * B[c];
+                }
             }
         }
-    }
-    UNROLL for (int i = 0; i < support; i++) {
-        UNROLL for (int c = 0; c < support; c++) {
-            double *to = node + (size_t)nodes[i * support + c] * MPM_NODE + at;
-            mpm_store_aligned(to, mpm_load_aligned(to) + mpm_join_pairs(sum[i][c], part));
+        const uint32_t *nodes = b->nodes[r];
+        const bool shares = next_shares(b, r);
+        UNROLL for (int i = 0; i < support; i++) {
+            add_to_node(node, nodes[i * support], sum[i][0], part);
+        }
+        if (!shares) {
+            UNROLL for (int i = 0; i < support; i++) {
+                UNROLL for (int c = 1; c < support; c++) {
+                    add_to_node(node, nodes[i * support + c], sum[i][c], part);
+                    sum[i][c] = mpm_splat(0);
+                }
+            }
+        }
+        UNROLL for (int i = 0; i < support; i++) {
+            UNROLL for (int c = 0; c + 1 < support; c++) {
+                sum[i][c] = sum[i][c + 1];
+            }
+            sum[i][support - 1] = mpm_splat(0);
         }
     }
 }
 
 MPM_KERNEL void scatter_records(const struct batch *b, const struct mpm_grid *g, const int dim,
                                 const enum mpm_basis basis) {
-    for (int r = 0; r < b->n_runs; r++) {
+    UNROLL for (int part = 0; part < PARTS && dim == 2; part++) {
+        scatter_part_2d(b, g->node, part, basis);
+    }
+    for (int r = 0; r < b->n_runs && dim == 3; r++) {
         UNROLL for (int part = 0; part < PARTS; part++) {
-            if (dim == 2) {
-                scatter_part_2d(b, g->node, b->nodes[r], b->run[r], b->run[r + 1], part, basis);
-            } else {
-                scatter_part(b, g->node, b->nodes[r], b->run[r], b->run[r + 1], part, basis);
-            }
+            scatter_part(b, g->node, b->nodes[r], b->run[r], b->run[r + 1], part, basis);
         }
     }
 }
