@@ -108,10 +108,18 @@ static void check_ids(const struct body_key *key, const cJSON *value, struct fau
         value_fault(faults, key, "type", value);
         return;
     }
-    bool sound = cJSON_GetArraySize(value) <= (int)key->most;
-    cJSON_ArrayForEach(item, value) sound = sound && is_id(item);
-    if (!sound)
-        value_fault(faults, key, "pattern", value);
+    if (cJSON_GetArraySize(value) > (int)key->most) {
+        value_fault(faults, key, "length", value);
+        return;
+    }
+    const struct scene_cursor root = {0}, list = {.parent = &root, .key = key->name};
+    struct scene_cursor at = {.parent = &list};
+    cJSON_ArrayForEach(item, value) {
+        if (!is_id(item))
+            scene_value_fault(faults, &at, cJSON_IsString(item) ? "pattern" : "type", ID_PATTERN,
+                              item);
+        at.index++;
+    }
 }
 
 static void check_key(const struct body_key *key, const cJSON *value, struct faults *faults) {

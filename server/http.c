@@ -18,6 +18,7 @@
 #include <string.h>
 #include <sys/resource.h>
 #include <sys/socket.h>
+#include <sys/stat.h>
 #include <time.h>
 #include <unistd.h>
 
@@ -649,9 +650,17 @@ static int listen_on(const struct http_address *address, bool tls, char *url, si
     return fd;
 }
 
-static char *file_text(const char *path, char *why, size_t why_bytes) {
+static char *file_text(const char *path, bool secret, char *why, size_t why_bytes) {
     char *text = calloc(1, TLS_FILE_MAX + 1);
     FILE *file = fopen(path, "re");
+    struct stat info;
+    // As the token and the keys of CURVE; but a group may hold those who serve with it.
+    if (secret && file != NULL && fstat(fileno(file), &info) == 0 && (info.st_mode & 07) != 0) {
+        snprintf(why, why_bytes, "%s: others can read it: chmod 640", path);
+        fclose(file);
+        free(text);
+        return NULL;
+    }
     size_t n = text != NULL && file != NULL ? fread(text, 1, TLS_FILE_MAX, file) : 0;
     if (n == 0) {
         snprintf(why, why_bytes, "%s: %s", path, file == NULL ? strerror(errno) : "is empty");
@@ -683,8 +692,8 @@ struct http_server *http_start(const struct http_address *address,
     server->listener = -1;
     set_limits(&server->counts);
     pthread_mutex_init(&server->lock, NULL);
-    if (tls && ((server->cert = file_text(address->tls_cert, why, why_bytes)) == NULL ||
-                (server->key = file_text(address->tls_key, why, why_bytes)) == NULL))
+    if (tls && ((server->cert = file_text(address->tls_cert, false, why, why_bytes)) == NULL ||
+                (server->key = file_text(address->tls_key, true, why, why_bytes)) == NULL))
         goto fail;
     server->listener = listen_on(address, tls, url, url_bytes, why, why_bytes);
     if (server->listener < 0)

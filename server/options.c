@@ -11,6 +11,7 @@
 #include <unistd.h>
 
 #define MAX_THREADS 1024
+#define MAX_QUEUE 100000
 #define MEMORY_SHARE 0.8           // of the machine, when --memory-limit is not given
 #define MAX_BODY ((size_t)8 << 20) // contract, section 2
 
@@ -107,6 +108,8 @@ static bool parse_publish(const char *text, struct options *o) {
     struct options address;
     if (strncmp(text, "tcp://", 6) != 0 || !parse_address(text + 6, &address))
         return false;
+    if (strcmp(address.http_host, "localhost") == 0) // ZeroMQ binds to addresses, not names
+        snprintf(address.http_host, sizeof address.http_host, "127.0.0.1");
     bool v6 = strchr(address.http_host, ':') != NULL;
     const char *port = strcmp(address.http_port, "0") == 0 ? "*" : address.http_port;
     o->publish_loopback = options_is_loopback(address.http_host);
@@ -228,7 +231,7 @@ static bool assign(struct options *o, enum option option, const char *value) {
     case OPTION_SLOTS:
         return parse_int(value, MAX_THREADS, &o->slots);
     case OPTION_QUEUE:
-        return parse_int(value, 100000, &o->queue);
+        return parse_int(value, MAX_QUEUE, &o->queue);
     case OPTION_RESUME:
         return parse_resume(value, &o->resume);
     case OPTION_TOKEN_FILE:
@@ -333,6 +336,27 @@ static bool complete(struct options *o, char *message, size_t n) {
     return true;
 }
 
+// In words, for the message about a value that is none.
+static const char *expected_of(enum option option) {
+    switch (option) {
+    case OPTION_HTTP:
+        return "HOST:PORT (an IPv6 address in brackets, a port up to 65535)";
+    case OPTION_PUBLISH:
+        return "tcp://HOST:PORT or ipc://PATH";
+    case OPTION_THREADS:
+    case OPTION_SLOTS:
+        return "a whole number, 1 to 1024";
+    case OPTION_QUEUE:
+        return "a whole number, 1 to 100000";
+    case OPTION_MEMORY_LIMIT:
+    case OPTION_MAX_BODY:
+        return "a whole number of bytes above 0, with or without K, M, G or T behind it";
+    default:
+        return table[option].value;
+    }
+}
+_Static_assert(MAX_THREADS == 1024 && MAX_QUEUE == 100000, "as the words above say");
+
 enum options_result options_parse(int argc, char *const *argv, struct options *out, char *message,
                                   size_t message_bytes) {
     *out = (struct options){.http_host = "127.0.0.1",
@@ -380,7 +404,7 @@ enum options_result options_parse(int argc, char *const *argv, struct options *o
         }
         if (!assign(out, (enum option)option, value)) {
             snprintf(message, message_bytes, "%s: must be %s, got '%s'", table[option].name,
-                     table[option].value, value);
+                     expected_of((enum option)option), value);
             return OPTIONS_BAD;
         }
     }

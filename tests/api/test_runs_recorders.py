@@ -30,8 +30,10 @@ def test_registration_is_checked(daemon, name):
     reply = put(daemon, name, "a", -1)
     assert reply["lag_frames"] == 1 and reply["lag_bytes"] == index(daemon, name)["frames"][0]["bytes"]
     daemon.ask("PUT", "/v1/runs/none/recorders/a", {"acked": -1}, status=404)
-    for bad in ("x", ["a b"], [1], ["a"] * 65):
-        assert daemon.ask("POST", "/v1/runs", {"scene": water(), "recorders": bad}, status=422).pointers == ["/recorders"]
+    for bad, pointers in (("x", ["/recorders"]), (["a"] * 65, ["/recorders"]), (["a b"], ["/recorders/0"]),
+                          (["a", 1, "b", ""], ["/recorders/1", "/recorders/3"])):  # fmt: skip
+        reply = daemon.ask("POST", "/v1/runs", {"scene": water(), "recorders": bad}, status=422)
+        assert reply.pointers == pointers, reply
     daemon.away(name)
 
 

@@ -64,6 +64,24 @@ def test_bad_options_exit_2(tmp_path, options):
     refused("--data-dir", tmp_path / "data", *options, code=2)
 
 
+@pytest.mark.parametrize(
+    "option, value, expected",
+    [("--slots", "0", "1 to 1024"), ("--threads", "1025", "1 to 1024"), ("--queue", "-1", "1 to 100000"),
+     ("--memory-limit", "1e9", "bytes"), ("--publish", "udp://x", "tcp://"), ("--http", "::1:0", "in brackets")],
+)  # fmt: skip
+def test_bad_options_say_what_was_expected(tmp_path, option, value, expected):
+    message = refused("--data-dir", tmp_path / "data", option, value, code=2)
+    assert f"fbard: {option}: must be " in message and expected in message and f"got '{value}'" in message
+
+
+def test_publish_takes_localhost_as_http_does(tmp_path):
+    d = Daemon(tmp_path, "--publish", "tcp://localhost:0").start()
+    try:
+        assert re.fullmatch(r"tcp://127\.0\.0\.1:[1-9]\d+", d.publish)
+    finally:
+        d.stop()
+
+
 def test_port_file_has_both_addresses_and_they_answer(daemon):
     ports = json.loads((daemon.folder / "ports.json").read_text())
     assert set(ports) == {"http", "publish"}
@@ -211,6 +229,9 @@ def test_tls_serves_https(tmp_path):
     subprocess.run(["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "1", "-subj", "/CN=localhost",
                     "-keyout", key, "-out", cert], check=True, capture_output=True)  # fmt: skip
     assert refused(*FREE, "--data-dir", tmp_path / "x", "--tls-cert", tmp_path / "none", "--tls-key", key)
+    key.chmod(0o604)
+    assert "chmod 640" in refused(*FREE, "--data-dir", tmp_path / "x", "--tls-cert", cert, "--tls-key", key)
+    key.chmod(0o640)
     d = Daemon(tmp_path / "d", "--tls-cert", str(cert), "--tls-key", str(key)).start()
     try:
         assert d.http.startswith("https://127.0.0.1:")
