@@ -316,6 +316,7 @@ static struct run *run_new(const struct run_host *host, const char *id) {
                                           .potential_energy = NAN,
                                           .external_work = NAN};
     r->ending = RUN_N_STATES;
+    r->memory_told = SIZE_MAX;
     r->stop_step = UINT64_MAX;
     r->stop_time = INFINITY;
     r->wall_from = r->wait_from = NAN;

@@ -60,6 +60,7 @@ struct run {
     double *row;      // (columns) scratch for a sample
     struct history history;
     struct replay replay;
+    size_t memory_told; // bytes that RUN_WARNING_MEMORY says are free; SIZE_MAX: it is not there
     bool wants_sim;   // a new run that is paused: so that its first frame is there
     bool due;         // a frame has to be taken at this step
     bool lonely;      // waits for subscribers before its first frame
@@ -79,6 +80,8 @@ struct run {
     double eta_wall[ETA_SAMPLES], eta_time[ETA_SAMPLES]; // a ring of the last seconds
     unsigned n_eta;
 };
+
+#define RUN_WARNING_MEMORY "waits for memory: " // of a run that is queued
 
 // What an action means in a state.
 enum run_verdict { RUN_REFUSED, RUN_ACTS, RUN_ALREADY };

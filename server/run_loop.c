@@ -16,6 +16,7 @@
 
 #define WARNING_ROOM "waits for room "
 #define WARNING_LONELY "waits for subscribers: "
+#define QUEUED_SECONDS 2.0   // between two looks for what a run waits that has no slot
 #define LONELY_SECONDS 0.02  // between two looks whether somebody has come
 #define PUBLISH_SECONDS 0.02 // between two copies of the status
 #define WAITING_SECONDS 0.25 // a shorter wait for the disk is not worth a change of state
@@ -488,6 +489,22 @@ static void begin_running(struct run *r) {
         run_state_enter(r, RUN_RUNNING);
 }
 
+// A slot may be free, and the run wait all the same: it says for how much memory.
+static void explain_queued(struct run *r) {
+    size_t left, told = r->memory_told;
+    bool lacks = slots_lack_memory(r->host->slots, &r->slot, &left);
+    r->memory_told = lacks ? left : SIZE_MAX;
+    if (r->memory_told == told)
+        return;
+    run_unwarn(&r->now, RUN_WARNING_MEMORY);
+    if (lacks)
+        run_warn(&r->now,
+                 RUN_WARNING_MEMORY "it needs %zu bytes, and %zu are free; runs that are paused "
+                                    "keep theirs until they are over",
+                 r->slot.needs, left);
+    run_status_publish(r, false);
+}
+
 // One turn of the loop in the present state.
 static void turn(struct run *r) {
     if (r->ending != RUN_N_STATES) {
@@ -505,7 +522,8 @@ static void turn(struct run *r) {
         if (slots_granted(r->host->slots, &r->slot)) {
             begin_running(r);
         } else {
-            wait_for_knock(r, 60);
+            explain_queued(r);
+            wait_for_knock(r, QUEUED_SECONDS);
         }
         break;
     case RUN_WAITING:

@@ -246,6 +246,10 @@ void run_state_enter(struct run *r, enum run_state state) {
     else
         run_wall_leave(r);
     r->now.state = state;
+    if (state != RUN_QUEUED) {
+        run_unwarn(&r->now, RUN_WARNING_MEMORY);
+        r->memory_told = SIZE_MAX;
+    }
     if (state == RUN_RUNNING && before != RUN_WAITING)
         eta_restart(r);
     run_status_fill(r, true);

@@ -82,6 +82,14 @@ bool slots_granted(struct slots *s, const struct slot *slot) {
     return granted;
 }
 
+bool slots_lack_memory(struct slots *s, const struct slot *slot, size_t *left) {
+    pthread_mutex_lock(&s->lock);
+    *left = s->used < s->memory ? s->memory - s->used : 0;
+    bool lacks = slot->asked && s->free > 0 && !fits(s, slot->needs);
+    pthread_mutex_unlock(&s->lock);
+    return lacks;
+}
+
 void slots_leave(struct slots *s, struct slot *slot) {
     pthread_mutex_lock(&s->lock);
     for (struct slot **link = &s->queue; *link != NULL; link = &(*link)->next)

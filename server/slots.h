@@ -25,6 +25,8 @@ void slots_free(struct slots *slots);
 // granted at once.
 bool slots_ask(struct slots *slots, struct slot *slot, size_t bytes);
 bool slots_granted(struct slots *slots, const struct slot *slot);
+// Whether the slot waits for memory alone: one is free. `*left`: bytes that nobody has reserved.
+bool slots_lack_memory(struct slots *slots, const struct slot *slot, size_t *left);
 void slots_leave(struct slots *slots,
                  struct slot *slot); // gives the slot back, or the place in the queue
 // Memory without a slot: false when it does not fit now.

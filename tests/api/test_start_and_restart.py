@@ -733,6 +733,34 @@ def test_what_was_refused_for_want_of_descriptors_is_no_run_after_a_restart(fres
     d.create(endless(), id=next(run for run in answers if run not in made))
 
 
+def test_run_that_waits_for_memory_says_so(fresh):
+    d = fresh().start()
+    large = endless(bodies={"bar": {"particles_per_cell": 256}}, time={"dt": 1e-4})
+    bytes_of = [d.ask("POST", "/v1/scenes:validate", s).json["estimate"]["bytes"] for s in (large, endless())]
+    limit = bytes_of[0] + bytes_of[1]  # beside two small ones it does not fit
+    d.stop()
+    d.options = ("--memory-limit", str(limit))
+    d.start()
+    for run in ("a", "b"):
+        d.create(endless(), id=run, start=False)
+        until(lambda run=run: d.frames(run))  # it has its memory
+    d.create(large, id="large")
+
+    def waits():
+        found = [re.search(r"waits for memory: it needs (\d+) bytes, and (\d+) are free", w)
+                 for w in d.run("large")["warnings"]]  # fmt: skip
+        return found and [int(x) for x in found[0].groups()]
+
+    needs, left = until(waits)
+    assert d.run("large")["state"] == "queued" and left < needs < limit
+    d.create(endless(), id="small")
+    d.wait("small", "running")  # it fits, and does not stand behind
+    d.act("small", "cancel")
+    d.act("a", "cancel")
+    d.act("b", "cancel")
+    assert not d.wait("large", "running")["warnings"]
+
+
 def test_run_that_no_longer_fits_says_why_it_is_queued(fresh):
     d = fresh().start()
     d.create(TINY, id="large", start=False)
