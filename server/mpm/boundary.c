@@ -237,7 +237,8 @@ static double *result(const struct mpm_grid *g, uint32_t node) {
 static void keep_real(struct mpm_wall *w, const struct mpm_grid *g, const double *gravity) {
     const int dim = g->dim;
     double *out = w->real;
-    for (const struct mpm_column *c = w->column; c < w->column + w->n_columns; c++) {
+    for (size_t k = 0; k < w->n_columns; k++) {
+        const struct mpm_column *c = &w->column[k];
         const uint32_t nodes[] = {c->ghost, c->plane, c->inner};
         for (int q = 0; q < 3; q++, out += 1 + dim) {
             const double *node = sums(g, nodes[q]);
@@ -366,7 +367,8 @@ static void apply_direct(const struct mpm_wall *walls, struct mpm_wall *w, struc
                          const double *gravity, double dt) {
     const int dim = g->dim;
     memset(w->reaction, 0, sizeof w->reaction);
-    for (const struct mpm_column *c = w->column; c < w->column + w->n_columns; c++) {
+    for (size_t k = 0; k < w->n_columns; k++) {
+        const struct mpm_column *c = &w->column[k];
         const double *node = sums(g, c->plane), m = node[0], *f = node + MPM_NODE_FORCE;
         if (!(m > 0)) {
             continue;
@@ -416,7 +418,8 @@ static void fill_ghosts(const struct mpm_wall *w, struct mpm_grid *g) {
         }
     }
     // What has come to lie beyond the image's reach is held as by a direct condition.
-    for (const struct mpm_beyond *b = w->beyond; b < w->beyond + w->n_beyond; b++) {
+    for (size_t k = 0; k < w->n_beyond; k++) {
+        const struct mpm_beyond *b = &w->beyond[k];
         if (!(w->open && b->column != UINT32_MAX && w->open[b->column])) {
             condition(w, result(g, b->node), dim);
         }
@@ -441,7 +444,8 @@ static void folded_reaction(const struct mpm_wall *walls, struct mpm_wall *w,
     const int dim = g->dim, axis = w->def.axis, planes[3] = {w->ghost, w->plane, w->inner};
     const double *real = w->real;
     memset(w->reaction, 0, sizeof w->reaction);
-    for (const struct mpm_column *c = w->column; c < w->column + w->n_columns; c++) {
+    for (size_t k = 0; k < w->n_columns; k++) {
+        const struct mpm_column *c = &w->column[k];
         const uint32_t nodes[] = {c->ghost, c->plane, c->inner};
         int place[MPM_MAX_DIM];
         memcpy(place, c->place, sizeof place);
