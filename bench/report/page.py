@@ -146,6 +146,9 @@ def write_docs(parts, shelf, folder, size, docs):
     out += [f"| [{s.title}](#{s.anchor}) | {s.verdict[0]} |" for _, sections in parts for s in sections]
     for title, sections in parts:
         out += ["", f"## {title}"]
+        if not sections:
+            out += ["", f"Not run at this size yet; [report-small.md](report-small.md#{title.lower().replace(' ', '-')}) has it." if size == "paper"
+                    else "Not run yet."]  # fmt: skip
         for s in sections:
             out += ["", f'<a id="{s.anchor}"></a>', f"### {s.title}", ""]
             for picture in s.pictures:
