@@ -83,7 +83,7 @@ $(call levels,$(LANES_SRC)): ALL_CFLAGS += $(LANES_FLAGS)
 
 .PHONY: studies all programs deps deps-page deps-long deps-report libmpm demo report report-page report-docs check check-all check-layers check-unit \
 	check-physics check-api check-page \
-	check-cli check-loss check-hard check-asan check-clang check-fuzz check-tsan unit-programs check-long bench bench-solver bench-peer \
+	check-cli check-loss check-hard check-asan check-clang check-fuzz check-tsan unit-programs check-long bench bench-docs bench-solver bench-peer \
 	bench-recording bench-page bench-status bench-threads bench-tutorial fuzz install uninstall format clean help
 .DELETE_ON_ERROR:
 .SECONDARY:
@@ -316,8 +316,12 @@ check-long: deps-long deps-page ## the longer verification: minutes to hours
 
 bench: bench-solver bench-recording bench-status bench-threads ## speed: the kernels, what recording costs, how fast the daemon answers, when threads pay
 
+# BENCH=GROUP: of one group only, e.g. kernels; `make bench-docs` makes one table of what was measured.
 bench-solver: $(B)/bench-solver ## kernels against the plain ones, ratios and growth; JSON in build/bench.json
-	$(Q)GOMP_SPINCOUNT=$(SPIN) $< --json build/bench.json $(BENCH)
+	$(Q)GOMP_SPINCOUNT=$(SPIN) $< --json build/bench$(if $(BENCH),-$(BENCH)).json $(BENCH)
+
+bench-docs: # docs/bench.md of what `make bench` or its groups left in build/
+	$(Q)$(PYTHON) bench/docs.py build/bench*.json > docs/bench.md.new && mv docs/bench.md.new docs/bench.md
 
 bench-peer: ## how to run the same block problem with another code
 	@cat docs/peers.md

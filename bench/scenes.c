@@ -71,6 +71,49 @@ static void compare(const char *name, const char *patch, const char *what, void 
     close_run(&b);
 }
 
+// ---- What two threads need to meet ----
+
+#define PIECES 2000
+
+static void nothing(void *context, int own, int there) {
+    (void)context;
+    (void)own;
+    (void)there;
+}
+static void pieces(void *context) {
+    for (int k = 0; k < PIECES; k++) {
+        mpm_team_run(context, nothing, NULL);
+    }
+}
+
+// Parallel work begins and ends, with nothing in between: us. A step with F-bar has six pieces of it.
+static void meeting(const char *name, const char *patch, const void *state, size_t bytes) {
+    struct run run = continue_scene(name, patch, 2, state, bytes);
+    if (run.sim) {
+        double us[MAX_ROUNDS], step[MAX_ROUNDS];
+        const int rounds = quick ? 5 : MAX_ROUNDS;
+        struct run one = continue_scene(name, patch, 1, state, bytes);
+        for (int r = 0; r < rounds; r++) {
+            const double t = wall_now();
+            mpm_team_hold(run.sim->team, pieces, run.sim->team);
+            us[r] = 1e6 * (wall_now() - t) / PIECES;
+            step[r] = one.sim ? 1e6 * timed(one.sim, 0.02) * (double)mpm_n_particles(one.sim) : NAN;
+        }
+        close_run(&one);
+        const double piece = median(us, rounds), whole = median(step, rounds);
+        printf("  a piece of parallel work that does nothing takes two threads %.2f us; six a step: %.1f us, "
+               "a step on one thread %.1f us: so at most %.2f times as fast\n",
+               piece, 6 * piece, whole, whole / (whole / 2 + 6 * piece));
+        open_row("meeting");
+        text("scene", name);
+        number("us_a_piece", piece);
+        number("us_a_step_on_one_thread", whole);
+        number("at_most_times_as_fast", whole / (whole / 2 + 6 * piece));
+        close_row();
+    }
+    close_run(&run);
+}
+
 // `spread`: a time when two threads are asked to share the work well.
 static void whole_scene(const char *name, const char *patch, double spread) {
     struct run run = open_scene(name, patch, 1);
@@ -135,6 +178,7 @@ static void whole_scene(const char *name, const char *patch, double spread) {
         compare(name, patch, "ns in the last tenth / in the first", state, bytes, 2, 1, 0, 1, 1 / 0.9);
         const double loss = clock_loss();
         printf("  both cores at work, multiply-adds take %.2f of their time alone\n", loss);
+        meeting(name, patch, state[1], bytes[1]);
         compare(name, patch, "spread out, two threads / one", state, bytes, 1, 2, 1, 1, loss / 1.7);
     }
     for (int k = 0; k < MOMENTS; k++) {

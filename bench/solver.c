@@ -719,6 +719,10 @@ int main(int argc, char **argv) {
     printf("calibration: %.3f ns for a multiply-add of the widest vectors, %.1f GB/s updated in place\n",
            1e9 * fma_seconds() * (mpm_isa_available(MPM_ISA_AVX512) ? 8 : 4),
            1e-9 / memory_seconds());
+    open_row("calibration");
+    number("multiply_add_ns", 1e9 * fma_seconds() * (mpm_isa_available(MPM_ISA_AVX512) ? 8 : 4));
+    number("in_place_gb_s", 1e-9 / memory_seconds());
+    close_row();
     kernels();
     stages();
     ratios();

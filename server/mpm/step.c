@@ -357,16 +357,21 @@ static void leave_stage_if_over(struct mpm_sim *sim) {
 }
 
 #define MOST_DRIFT 0.999 // cells: below 1 by more than the round-off of a position in cells
-#define MOST_RUNS 1.2    // times as many runs as after a sort: each then holds too few particles
-#define LEAST_STEPS 10   // between two sorts for speed's sake: a sort costs about three steps
+#define SORT_COST 3.0    // of a sort, in steps: 1 to 3
+#define RUN_COST 1.5     // of a run, beside its particles, in particles
+#define LEAST_STEPS 50   // between two sorts for speed's sake: so they take a few per cent at most
 
-// A sort is due when a particle may have drifted out of its tile's reach, or when too many have
-// left their cell's run. That depends on the state alone, so it comes at the same steps for any
-// number of threads and after a restart.
-static bool sort_is_due(const struct mpm_clockwork *c) {
+// A sort is due when a particle may have drifted out of its tile's reach, or when runs that have
+// been broken since the last one have cost as much as a sort does: they grow about linearly. That
+// depends on the state alone, so it comes at the same steps for any number of threads and after a
+// restart.
+static bool sort_is_due(const struct mpm_sim *sim) {
+    const struct mpm_clockwork *c = &sim->c;
+    const double steps = (double)c->steps_since_sort;
+    const double broken = (double)c->runs - (double)c->runs_at_sort;
     return !c->is_sorted || c->drift > MOST_DRIFT ||
            (c->steps_since_sort >= LEAST_STEPS &&
-            (double)c->runs > MOST_RUNS * (double)c->runs_at_sort);
+            0.5 * steps * broken * RUN_COST > SORT_COST * (double)sim->n_particles);
 }
 
 // eqs. 7, 8, 10, and the forces of loads and rigid bodies.
@@ -425,7 +430,7 @@ static enum mpm_status step(struct mpm_sim *sim, struct mpm_error *err) {
     double gravity[MPM_MAX_DIM] = {0};
     mpm_gravity_at(sim, sim->c.time, gravity);
     double clock = now_or_zero(sim);
-    if (sort_is_due(&sim->c)) {
+    if (sort_is_due(sim)) {
         if (!mpm_sort(sim)) {
             return step_failure(sim, MPM_ERR_MEMORY, time, -1, "bytes of particles and grid",
                                 (double)mpm_bytes(sim), err);
