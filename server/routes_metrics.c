@@ -131,6 +131,10 @@ static void put_process(FILE *out) {
         closedir(folder);
         single(out, "process_open_fds", "gauge", "Open file descriptors.", n);
     }
+    struct rlimit files;
+    if (getrlimit(RLIMIT_NOFILE, &files) == 0 && files.rlim_cur != RLIM_INFINITY)
+        single(out, "process_max_fds", "gauge", "Most file descriptors that may be open.",
+               (double)files.rlim_cur);
 }
 
 // ---- Runs -------------------------------------------------------------------------------------

@@ -1,5 +1,6 @@
 // Routes about the daemon itself, its materials and scenes, and scenes in a body.
 #include <stdio.h>
+#include <stdlib.h>
 #include <string.h>
 
 #include "server/bodies.h"
@@ -138,10 +139,14 @@ static cJSON *builtin_named(const char *name, struct faults *faults) {
     cJSON *scene = scene_builtin(name);
     if (scene != NULL)
         return scene;
-    char list[512] = "one of", actual[96];
-    for (size_t k = 0; k < scene_builtin_count(); k++) {
-        size_t n = strlen(list);
-        snprintf(list + n, sizeof list - n, " %s", scene_builtin_name(k));
+    char *list = NULL, actual[96];
+    size_t bytes;
+    FILE *text = open_memstream(&list, &bytes);
+    if (text != NULL) {
+        fputs("one of", text);
+        for (size_t k = 0; k < scene_builtin_count(); k++)
+            fprintf(text, "%s %s", k > 0 ? "," : "", scene_builtin_name(k));
+        fclose(text);
     }
     const char *near = nearest_scene(name);
     snprintf(actual, sizeof actual, "%.90s", name);
@@ -151,6 +156,7 @@ static cJSON *builtin_named(const char *name, struct faults *faults) {
     else
         faults_add(faults, "/scene", "unknown_scene", list, actual,
                    "there is no built-in scene %.90s", name);
+    free(list);
     return NULL;
 }
 

@@ -144,7 +144,10 @@ def test_three_dimensions(daemon, name):
 def test_scene_of_no_such_name_is_404_to_read_and_422_to_run(daemon):
     daemon.ask("GET", "/v1/scenes/dam-brake", status=404)
     reply = daemon.ask("POST", "/v1/runs", {"scene": "dam-brake"}, status=422)
-    assert "dam-break" in reply.fault("/scene")["detail"], "did you mean"
+    fault = reply.fault("/scene")
+    assert "dam-break" in fault["detail"], "did you mean"
+    names = [scene["name"] for scene in daemon.get("/v1/scenes")["scenes"]]
+    assert fault["expected"] == "one of " + ", ".join(names), "all of them, not cut"
 
 
 def test_a_scene_beyond_the_memory_limit_is_422_before_anything_is_allocated(tmp_path):

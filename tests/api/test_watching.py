@@ -300,6 +300,7 @@ def test_metrics_count_what_was_done(daemon, name):
     assert now["fbard_recorder_lag_frames", f'{{run="{name}",recorder="me"}}'] == 2
     assert now["fbard_run_step", f'{{run="{name}"}}'] == 35
     assert now["fbard_journal_bytes", ""] > 0 and now["process_resident_memory_bytes", ""] > 1e6
+    assert 0 < now["process_open_fds", ""] < now["process_max_fds", ""]
     assert sum(v for (k, label), v in now.items() if k == "fbard_run_phase_seconds" and name in label) > 0
     daemon.away(name)
     assert not any(name in label for _, label in metrics(daemon)), "what is gone is not told of"
