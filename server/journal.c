@@ -113,19 +113,21 @@ static bool make_folders(const char *path, char *why) {
     }
 }
 
+// A run's folder, which holds plain files only. Never what a link names: that is not the daemon's;
+// the link alone goes.
 static void remove_tree(const char *path) {
-    DIR *dir = opendir(path);
+    int fd = open(path, O_RDONLY | O_DIRECTORY | O_NOFOLLOW | O_CLOEXEC);
+    DIR *dir = fd >= 0 ? fdopendir(fd) : NULL;
     if (dir != NULL) {
-        for (const struct dirent *entry; (entry = readdir(dir)) != NULL;) {
-            char inside[PATH_MAX];
-            if (strcmp(entry->d_name, ".") == 0 || strcmp(entry->d_name, "..") == 0)
-                continue;
-            if (snprintf(inside, sizeof inside, "%s/%s", path, entry->d_name) < (int)sizeof inside)
-                unlink(inside); // a run's folder holds plain files only
-        }
+        for (const struct dirent *entry; (entry = readdir(dir)) != NULL;)
+            if (strcmp(entry->d_name, ".") != 0 && strcmp(entry->d_name, "..") != 0)
+                unlinkat(fd, entry->d_name, 0);
         closedir(dir);
+    } else if (fd >= 0) {
+        close(fd);
     }
-    rmdir(path);
+    if (rmdir(path) != 0)
+        unlink(path); // which no folder minds
 }
 
 void journal_path(const struct journal *journal, const char *name, char *out, size_t bytes) {
@@ -232,8 +234,11 @@ char **journal_list(const char *data_dir, size_t *count) {
         char inside[PATH_MAX];
         if (strcmp(entry->d_name, ".") == 0 || strcmp(entry->d_name, "..") == 0)
             continue;
-        if (entry->d_name[0] == '.') { // .new-ID, .old-ID: no id begins with a dot
-            if (snprintf(inside, sizeof inside, "%s/%s", path, entry->d_name) < (int)sizeof inside)
+        if (entry->d_name[0] == '.') { // no id begins with a dot
+            bool own = strncmp(entry->d_name, ".new-", 5) == 0 ||
+                       strncmp(entry->d_name, ".old-", 5) == 0; // others are somebody else's
+            if (own &&
+                snprintf(inside, sizeof inside, "%s/%s", path, entry->d_name) < (int)sizeof inside)
                 remove_tree(inside);
             continue;
         }

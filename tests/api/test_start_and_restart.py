@@ -594,6 +594,27 @@ def test_a_damaged_run_does_not_keep_the_daemon_from_starting(fresh):
     d.wait(again, "completed")
 
 
+def test_nothing_is_removed_through_a_link_in_the_data_folder(fresh, tmp_path):
+    """A run's folder may be a link to a larger disk, or to anywhere: what it names is not the daemon's."""
+    d = fresh().start()
+    d.stop()
+    runs, foreign = d.data / "runs", tmp_path / "foreign"
+    for folder in ("deleted", "old", "new"):
+        (foreign / folder).mkdir(parents=True)
+        (foreign / folder / "precious").write_text("x")
+    (runs / ".snapshots").mkdir()
+    (runs / ".snapshots" / "precious").write_text("x")
+    for link, to in (("linked", "deleted"), (".old-x", "old"), (".new-x", "new")):
+        (runs / link).symlink_to(foreign / to)
+    d.start()
+    assert d.run("linked")["state"] == "failed"
+    d.ask("DELETE", "/v1/runs/linked", status=204)
+    d.create(endless(), id="x", start=False)  # clears .new-x before
+    assert all((foreign / folder / "precious").exists() for folder in ("deleted", "old", "new"))
+    assert (runs / ".snapshots" / "precious").exists(), "neither what merely begins with a dot"
+    assert sorted(p.name for p in runs.iterdir()) == [".snapshots", "x"]
+
+
 def test_torn_tails_are_cut(fresh, reference):
     d = fresh().start()
     begin(d)
