@@ -24,7 +24,7 @@ def test_config_shows_what_can_be_patched(daemon, live):
 
 
 def test_fbar_toggles_in_mid_run(daemon, live):
-    for form in (True, False, {"scheme": "anchored", "a": 0.05, "C": 1}, {"scheme": "zhao"}, False):
+    for form in (True, False, {"scheme": "anchored", "a": 0.05, "C": 1}, {"scheme": "anchored", "keep": 0.1}, {"scheme": "zhao"}, False):
         before = daemon.run(live)["step"]
         answer = daemon.patch(live, {"fbar": form})
         assert answer["effective_step"] >= before
@@ -35,7 +35,7 @@ def test_fbar_toggles_in_mid_run(daemon, live):
         config = daemon.get(f"/v1/runs/{live}/config")["fbar"]
         assert bool(config) == bool(form)
         if isinstance(form, dict) and form["scheme"] == "anchored":
-            assert (config["scheme"], config["a"], config["C"]) == ("anchored", 0.05, 1)
+            assert (config["scheme"], config["a"], config["C"], config["keep"]) == ("anchored", 0.05, 1, form.get("keep", 0))
         assert daemon.get(f"/v1/runs/{live}/scene")["fbar"] == config
 
 

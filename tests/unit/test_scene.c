@@ -151,6 +151,7 @@ static void test_scene_refuses_values_out_of_bounds(void **state) {
     assert_fault("{\"transfer\":{\"blend\":1.01}}", "/transfer/blend", "range");
     assert_fault("{\"fbar\":{\"scheme\":\"anchored\",\"a\":0}}", "/fbar/a", "range");
     assert_fault("{\"fbar\":{\"scheme\":\"anchored\",\"C\":-1}}", "/fbar/C", "range");
+    assert_fault("{\"fbar\":{\"scheme\":\"anchored\",\"keep\":1.1}}", "/fbar/keep", "range");
     assert_fault("{\"materials\":{\"rubber\":{\"poisson_ratio\":0.5}}}",
                  "/materials/rubber/poisson_ratio", "range");
     assert_fault("{\"materials\":{\"rubber\":{\"youngs_modulus\":0}}}",
@@ -262,6 +263,7 @@ static void test_scene_refuses_what_does_not_go_together(void **state) {
     (void)state;
     assert_fault("{\"time\":{\"dt\":1e-4,\"cfl\":0.3}}", "/time/cfl", "conflict");
     assert_fault("{\"fbar\":{\"scheme\":\"zhao\",\"a\":0.1}}", "/fbar/a", "conflict");
+    assert_fault("{\"fbar\":{\"scheme\":\"zhao\",\"keep\":0.1}}", "/fbar/keep", "conflict");
     assert_fault("{\"probes\":{\"energy\":{\"axis\":\"x\"}}}", "/probes/energy/axis", "conflict");
     assert_fault("{\"output\":{\"fields\":[\"position\",\"position\"]}}", "/output/fields/1",
                  "conflict");
@@ -1078,6 +1080,7 @@ static void test_scene_definition_follows_the_scene(void **state) {
     assert_true(def->cell == 0.5 && def->domain_max[1] == 4);
     assert_int_equal(def->settings.fbar.scheme, MPM_FBAR_ANCHORED);
     assert_true(def->settings.fbar.a == 0.1 && def->settings.fbar.C == 1);
+    assert_true(def->settings.fbar.keep == 0);
     assert_true(def->settings.blend == 0.9 && def->settings.damping_mass == 0.2);
     assert_true(def->settings.gravity[1] == -9.81);
     assert_true(def->settings.dt == 0 && def->settings.cfl == 0.3);
