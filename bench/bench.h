@@ -21,7 +21,8 @@ double fma_seconds(void);
 double clock_loss(void);
 // Seconds per particle and step, of steps that take about `seconds`; NaN when one fails.
 double timed(struct mpm_sim *sim, double seconds);
-// Median of the rounds' ratios, one / other, and of one's ns per particle and step.
+// Median of the rounds' ratios, one / other, and of one's ns per particle and step; of several
+// threads the ratio of their best rounds.
 double pair_of(struct mpm_sim *one, struct mpm_sim *other, double *ns);
 void verdict_row(const char *group, const char *what, double ns, double ratio, double most);
 

@@ -53,8 +53,8 @@ def main():
     calibration = of("calibration")
     print("# What `make bench` measured\n")
     print("Made by `make bench-docs` from the JSON of `make bench` (its groups one after another: `make bench-solver BENCH=kernels` and so on, and `make bench-recording`). "
-          "Every row is a median of rounds in which the things compared took turns; [design.md](design.md#the-kernels) says what the limits are. In brackets what was asked for, "
-          "on the machine of the goals: ns on another machine, and so the share of the limit, are no verdict, the ratios are.\n")  # fmt: skip
+          "Every row is a median of rounds in which the things compared took turns (of two threads, on the wall clock: the best rounds); [design.md](design.md#the-kernels) says what the limits are. In brackets what was asked for, "
+          "on the machine of the goals: ns on another machine, and so the share of the limit, are no verdict, the ratios are. Groups that were measured more than once have a row a time: machines that others share change by a factor of 1.5 from one minute to the next, and two threads feel it first.\n")  # fmt: skip
     if calibration:
         fma = sorted(r["multiply_add_ns"] for r in calibration)
         memory = sorted(r["in_place_gb_s"] for r in calibration)
@@ -76,13 +76,14 @@ def main():
         print("Bytes a particle with its share of the grid, 100,000 particles; asked for with F̄ and neo-Hookean: 200 in 2D, 320 in 3D.\n")
         print(table(["case", "bytes"], [[case(r), f"{r['bytes_per_particle']:.0f}"] for r in of("bytes")]) + "\n")
     if of("sort"):
-        print("## Sorting\n\n" + "\n".join(f"- {r['dimension']}D: a sort takes {r['steps_per_sort']:.2f} steps; in whole scenes see the phases below." for r in of("sort")) + "\n")
+        print("## Sorting\n\n" + "\n".join(f"- {r['dimension']}D: a sort that finds all in order takes {r['steps_per_sort']:.2f} steps; what sorting takes of whole runs: the phases below." for r in of("sort")) + "\n")
     if of("growth"):
         print("## Growth\n\n2D, 4 a cell, `zhao`.\n")
         print(table(["particles", "ns", "M/s", "bytes"], [[f"{r['particles']:,.0f}", f"{r['ns_per_particle_step']:.1f}", f"{1e3 / r['ns_per_particle_step']:.1f}", f"{r['bytes_per_particle']:.0f}"] for r in of("growth")]) + "\n")
     for r in of("publishing"):
         print(f"## Publishing\n\nA frame every 100 steps of 102,400 particles, on one thread: {100 * r['share']:.2f} % of its time (at most 2 %: "
-              f"{'met' if r['share'] <= 0.02 else 'missed'}); its processor time a step against that without frames, in turns: {r['ratio']:.3f} (middle half {r['middle'][0]:.3f} to {r['middle'][1]:.3f}).\n")  # fmt: skip
+              f"{'met' if r['share'] <= 0.02 else 'missed'}); its processor time a step against that without frames, in turns: {r['ratio']:.3f} (middle half {r['middle'][0]:.3f} to {r['middle'][1]:.3f}). "
+              f"Sorting takes {100 * r['sort']:.1f} % of this run: water that sloshes, 256 particles a cell.\n")  # fmt: skip
     scenes = of("scenes", "meeting")
     if scenes:
         print("## Scenes\n")

@@ -249,6 +249,14 @@ double median(const double *values, int n) {
     return n % 2 ? sorted[n / 2] : (sorted[n / 2 - 1] + sorted[n / 2]) / 2;
 }
 
+static double least(const double *values, int n) {
+    double found = INFINITY;
+    for (int k = 0; k < n; k++) {
+        found = fmin(found, values[k]);
+    }
+    return found;
+}
+
 static double bytes_per_particle(const struct mpm_sim *sim) {
     return (double)mpm_bytes(sim) / (double)mpm_n_particles(sim);
 }
@@ -320,26 +328,30 @@ static void kernel_row(const char *group, struct block b, struct goal goal) {
         mpm_free(slow);
         return;
     }
-    double ns[MAX_ROUNDS], slow_ns[MAX_ROUNDS], ratio[MAX_ROUNDS], share[MAX_ROUNDS],
-        fma[MAX_ROUNDS], memory[MAX_ROUNDS];
+    double ns[MAX_ROUNDS], slow_ns[MAX_ROUNDS], ratio[MAX_ROUNDS], fma[MAX_ROUNDS],
+        memory[MAX_ROUNDS];
     timed(fast, turn / 2);
     timed(slow, turn / 2);
     for (int r = 0; r < rounds; r++) {
         const double f = timed(fast, turn), s = timed(slow, turn);
-        const double flop = fma_seconds(), byte = memory_seconds();
-        const struct limit limit = limit_of(b);
-        const double in_cache = (double)mpm_bytes(fast) < 8e6 ? 0 : limit.bytes * byte;
         ns[r] = 1e9 * f;
         slow_ns[r] = 1e9 * s;
         ratio[r] = s / f;
-        fma[r] = 1e9 * flop;
-        memory[r] = 1e9 * byte;
-        share[r] = mpm_support(b.basis) == 3 ? fmax(limit.flops * flop, in_cache) / f : NAN;
+        fma[r] = 1e9 * fma_seconds();
+        memory[r] = 1e9 * memory_seconds();
     }
     const double times = median(ratio, rounds), wanted_share = goal.limit / goal.ns;
+    // Of the best that the machine did in these moments, since others use its memory, too.
+    const struct limit limit = limit_of(b);
+    const double through_memory =
+        (double)mpm_bytes(fast) < 8e6 ? 0 : limit.bytes * least(memory, rounds);
+    const double share = mpm_support(b.basis) == 3
+                             ? fmax(limit.flops * least(fma, rounds), through_memory) /
+                                   median(ns, rounds)
+                             : NAN;
     char percent[16] = "  -";
-    if (isfinite(share[0])) {
-        snprintf(percent, sizeof percent, "%3.0f %%", 100 * median(share, rounds));
+    if (isfinite(share)) {
+        snprintf(percent, sizeof percent, "%3.0f %%", 100 * share);
     }
     printf("%dD %2.0f/cell %7zu %-8s %-8s %-17s %-6s %6.1f ns %5.1f M/s %5.2fx plain %s of "
            "limit %4.0f B",
@@ -360,7 +372,7 @@ static void kernel_row(const char *group, struct block b, struct goal goal) {
     number("ns_per_particle_step", median(ns, rounds));
     number("plain_ns_per_particle_step", median(slow_ns, rounds));
     number("times_plain", times);
-    number("share_of_limit", median(share, rounds));
+    number("share_of_limit", share);
     number("fma_ns", median(fma, rounds));
     number("ns_per_byte_in_place", median(memory, rounds));
     number("bytes_per_particle", bytes_per_particle(fast));
@@ -461,9 +473,9 @@ static void stages(void) {
 double pair_of(struct mpm_sim *one, struct mpm_sim *other, double *ns) {
     const int rounds = quick ? 5 : 15;
     const double turn = quick ? 0.02 : 0.05;
-    double ratio[MAX_ROUNDS], first[MAX_ROUNDS];
-    double (*const clock)(void) =
-        one->def->n_threads > 1 || other->def->n_threads > 1 ? wall_now : now;
+    double ratio[MAX_ROUNDS], first[MAX_ROUNDS], second[MAX_ROUNDS];
+    const bool wall = one->def->n_threads > 1 || other->def->n_threads > 1;
+    double (*const clock)(void) = wall ? wall_now : now;
     timed(one, turn);
     timed(other, turn);
     for (int r = 0; r < rounds; r++) { // who begins takes turns, too
@@ -477,9 +489,12 @@ double pair_of(struct mpm_sim *one, struct mpm_sim *other, double *ns) {
         }
         ratio[r] = x / y;
         first[r] = 1e9 * x;
+        second[r] = 1e9 * y;
     }
-    *ns = median(first, rounds);
-    return median(ratio, rounds);
+    // On the wall clock what others take counts, and two threads wait for the one that they take it
+    // from: so the best rounds are compared.
+    *ns = wall ? least(first, rounds) : median(first, rounds);
+    return wall ? least(first, rounds) / least(second, rounds) : median(ratio, rounds);
 }
 
 void verdict_row(const char *group, const char *what, double ns, double ratio, double most) {
@@ -522,7 +537,7 @@ double clock_loss(void) {
         }
         loss[r] = fmax(together[0], together[1]) / alone;
     }
-    return median(loss, rounds);
+    return fmax(median(loss, rounds), 1); // below it is noise
 }
 
 static void ratios(void) {
@@ -561,13 +576,20 @@ static void ratios(void) {
                           : "Hencky + J2, all flowing / neo-Hookean, 3D",
                  one, other, 1.5);
     }
+}
+
+static void threads(void) {
+    if (!wanted("threads")) {
+        return;
+    }
     const double loss = clock_loss();
     printf("\nTwo threads against one: both at work, multiply-adds take %.2f of their time alone; "
            "the goal "
            "is for the ratio over that\n",
            loss);
     for (int dim = 2; dim <= 3; dim++) {
-        one = other = block_of(dim, 2, 1e5, MPM_FBAR_ZHAO);
+        const struct block other = block_of(dim, 2, 1e5, MPM_FBAR_ZHAO);
+        struct block one = other;
         one.n_threads = 2;
         pair_row("threads",
                  dim == 2 ? "two threads / one, 2D, 100k" : "two threads / one, 3D, 100k", one,
@@ -704,7 +726,7 @@ int main(int argc, char **argv) {
             fprintf(
                 stderr,
                 "usage: bench-solver [--quick] [--json FILE] [GROUP]\n"
-                "groups: kernels stages ratios features sort growth scenes\n");
+                "groups: kernels stages ratios threads features sort growth scenes\n");
             return 2;
         } else {
             filter = argv[k];
@@ -726,6 +748,7 @@ int main(int argc, char **argv) {
     kernels();
     stages();
     ratios();
+    threads();
     features();
     sorting();
     growth();

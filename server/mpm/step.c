@@ -357,9 +357,9 @@ static void leave_stage_if_over(struct mpm_sim *sim) {
 }
 
 #define MOST_DRIFT 0.999 // cells: below 1 by more than the round-off of a position in cells
-#define SORT_COST 3.0    // of a sort, in steps: 1 to 3
+#define SORT_COST 3.0    // of a sort, in steps: 1 in cache, 3 beyond
 #define RUN_COST 1.5     // of a run, beside its particles, in particles
-#define LEAST_STEPS 50   // between two sorts for speed's sake: so they take a few per cent at most
+#define LEAST_STEPS 120  // between two sorts for speed's sake: so they take 3 % at most
 
 // A sort is due when a particle may have drifted out of its tile's reach, or when runs that have
 // been broken since the last one have cost as much as a sort does: they grow about linearly. That
