@@ -256,7 +256,7 @@ PAGE_MODULES = build/page/node_modules
 $(PAGE_MODULES)/.installed: tests/page/package.json tests/page/package-lock.json tests/page/.npmrc
 	$(call say,NPM,$(@D))
 	@mkdir -p build/page && cp $^ build/page
-	$(Q)cd build/page && npm ci --ignore-scripts --silent && touch node_modules/.installed
+	$(Q)cd build/page && npm ci --ignore-scripts --silent --prefer-offline && touch node_modules/.installed
 check-page: all $(PAGE_MODULES)/.installed ## the live page in a real browser
 	$(Q)FBARD=$(CURDIR)/$(B)/fbard PAGE_MODULES=$(CURDIR)/build/page node --test --test-reporter=spec tests/page/page.test.mjs
 

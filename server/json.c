@@ -612,9 +612,12 @@ static void number_text(char out[32], double value) {
         snprintf(out, 32, "%lld", (long long)value); // most are counts, and this is the same text
         return;
     }
-    snprintf(out, 32, "%.15g", value);
-    if (strtod(out, NULL) != value)
-        snprintf(out, 32, "%.17g", value); // always the same double
+    for (int digits = 15; digits < 17; digits++) {
+        snprintf(out, 32, "%.*g", digits, value);
+        if (strtod(out, NULL) == value)
+            return;
+    }
+    snprintf(out, 32, "%.17g", value); // always the same double
 }
 
 // Makes the number an item that cJSON prints as it stands (and that keeps its valuedouble).

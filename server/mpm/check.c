@@ -53,7 +53,9 @@ double mpm_def_dt_limit(const struct mpm_def *def, size_t stage) {
         c = fmax(c, m->model->wave_speed(m->parameters));
         nu = fmax(nu, m->model->diffusivity ? m->model->diffusivity(m->parameters) : 0);
     }
-    return mpm_stability_limit(mpm_stability_of(def), def->cell, c + largest_speed(def), nu);
+    return mpm_stability_limit(
+        mpm_stability_of(def), def->cell, c + largest_speed(def), nu,
+        fmax(0, mpm_stage_settings(def, stage, &def->settings).damping_mass));
 }
 
 static enum mpm_status range_fault(struct mpm_error *err, const char *pointer, const char *key,
@@ -103,8 +105,8 @@ enum mpm_status mpm_check_settings(const struct mpm_settings *s, const char *poi
         return mpm_fail_value(
             err, MPM_ERR_UNSTABLE_DT, TEXT("%s/time/dt", pointer), TEXT("at most %.6g s", dt_limit),
             TEXT("%.9g", s->dt),
-            "dt = %.6g s is above the stability limit of %.6g s for this cell and "
-            "wave speed; use time.cfl, or \"unstable_ok\": true",
+            "dt = %.6g s is above the stability limit of %.6g s for this cell, wave speed and "
+            "damping; use time.cfl, or \"unstable_ok\": true",
             s->dt, dt_limit);
     }
     if (s->dt == 0 && !(s->cfl > 0 && is_finite(s->cfl))) {
@@ -686,8 +688,8 @@ static void check_stages(struct report *r, const struct mpm_def *def) {
         const struct mpm_settings defaults = mpm_settings_default(),
                                   now = mpm_stage_settings(def, k, &defaults);
         struct mpm_error fault;
-        if (mpm_check_settings(&now, TEXT("/stages/%zu", k), def->dimension, INFINITY, INFINITY, true,
-                               &fault)) {
+        if (mpm_check_settings(&now, TEXT("/stages/%zu", k), def->dimension, INFINITY, INFINITY,
+                               true, &fault)) {
             add(r, &fault);
         }
         for (size_t m = 0; s->materials && m < def->n_materials; m++) {

@@ -59,9 +59,14 @@ double mpm_largest_speed(const struct mpm_sim *sim) {
     return largest;
 }
 
-double mpm_dt_limit(const struct mpm_sim *sim) {
+static double dt_limit_with(const struct mpm_sim *sim, const struct mpm_settings *settings) {
     return mpm_stability_limit(mpm_stability_of(sim->def), sim->grid.h,
-                               mpm_wave_speed(sim) + mpm_largest_speed(sim), diffusivity(sim));
+                               mpm_wave_speed(sim) + mpm_largest_speed(sim), diffusivity(sim),
+                               settings->damping_mass);
+}
+
+double mpm_dt_limit(const struct mpm_sim *sim) {
+    return dt_limit_with(sim, &sim->c.now);
 }
 
 double mpm_next_dt(const struct mpm_sim *sim) {
@@ -678,7 +683,7 @@ enum mpm_status mpm_change(struct mpm_sim *sim, const struct mpm_settings *setti
     struct mpm_settings now = sim->c.now;
     overlay(&now, settings, which);
     const enum mpm_status status =
-        mpm_check_settings(&now, "", sim->def->dimension, mpm_dt_limit(sim),
+        mpm_check_settings(&now, "", sim->def->dimension, dt_limit_with(sim, &now),
                            mpm_stability_of(sim->def).wave, sim->def->unstable_ok, err);
     if (status) {
         return status;

@@ -46,7 +46,9 @@ struct mpm_stability mpm_stability_of(const struct mpm_def *def) {
     return least;
 }
 
-double mpm_stability_limit(struct mpm_stability s, double cell, double speed, double diffusivity) {
-    const double wave = speed / (s.wave * cell), viscous = diffusivity / (s.viscous * cell * cell);
-    return 2 / (viscous + sqrt(viscous * viscous + 4 * wave * wave));
+double mpm_stability_limit(struct mpm_stability s, double cell, double speed, double diffusivity,
+                           double alpha) {
+    const double wave = speed / (s.wave * cell);
+    const double damped = diffusivity / (s.viscous * cell * cell) + alpha / 2;
+    return 2 / (damped + sqrt(damped * damped + 4 * wave * wave));
 }

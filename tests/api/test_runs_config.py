@@ -79,6 +79,9 @@ def test_unstable_dt_is_refused_with_its_limit(daemon, live):
     assert any(c.isdigit() for c in fault["expected"])
     assert "1" in fault["actual"]
     assert daemon.get(f"/v1/runs/{live}/config")["time"]["dt"] == 1e-3
+    # So is damping that makes the present one unstable.
+    daemon.ask("PATCH", f"/v1/runs/{live}/config", {"damping": {"mass": 1e4}}, status=422).fault("/time/dt")
+    assert daemon.get(f"/v1/runs/{live}/config")["damping"]["mass"] == 0
     assert daemon.run(live)["state"] == "running"
 
 

@@ -553,6 +553,49 @@ static void test_sim_unstable_dt_is_a_status(void **state) {
     mpm_free(sim);
 }
 
+static double kinetic_after(double dt, double mass_damping, int steps) {
+    define(2, RUBBER);
+    world.def.settings.dt = dt;
+    world.def.settings.damping_mass = mass_damping;
+    world.def.unstable_ok = true;
+    world.bodies[0].velocity = (struct mpm_velocity){
+        .kind = MPM_VELOCITY_MODE, .number = 1, .length = 0.5, .amplitude = 1e-3};
+    struct mpm_sim *sim = create();
+    struct mpm_balance first, last;
+    mpm_balance(sim, &first);
+    for (int k = 0; k < steps; k++) {
+        step(sim);
+    }
+    mpm_balance(sim, &last);
+    mpm_free(sim);
+    return last.kinetic_energy / first.kinetic_energy;
+}
+
+// Damping in proportion to mass flips a velocity in a step of 2/alpha: the limit knows of it, and a
+// change that it makes unstable is refused.
+static void test_sim_limit_counts_mass_damping(void **state) {
+    (void)state;
+    define(2, RUBBER);
+    world.def.settings.dt = 0;
+    struct mpm_sim *sim = create();
+    const double plain = mpm_dt_limit(sim), alpha = 100 / plain;
+    struct mpm_settings now = mpm_settings_now(sim);
+    struct mpm_error err = {0};
+    now.damping_mass = alpha;
+    assert_int_equal(mpm_change(sim, &now, MPM_SET_DAMPING, &err), MPM_OK); // with a CFL number
+    const double limit = mpm_dt_limit(sim);
+    assert_true(limit < 2 / alpha && limit > 1.99 / alpha);
+    now.dt = 0.5 * plain;
+    assert_int_equal(mpm_change(sim, &now, MPM_SET_TIME, &err), MPM_ERR_UNSTABLE_DT);
+    now.damping_mass = 0;
+    assert_int_equal(mpm_change(sim, &now, MPM_SET_TIME | MPM_SET_DAMPING, &err), MPM_OK);
+    now.damping_mass = alpha;
+    assert_int_equal(mpm_change(sim, &now, MPM_SET_DAMPING, &err), MPM_ERR_UNSTABLE_DT);
+    mpm_free(sim);
+    assert_true(kinetic_after(0.99 * limit, alpha, 100) < 1);
+    assert_true(kinetic_after(1.05 * limit, alpha, 100) > 100);
+}
+
 // uGIMP's walls hold nodes, so that a particle pressed against one may sink in by half its own size
 // before it counts as lost, where the wall stands on the domain's edge; elsewhere it may not.
 static void test_sim_exit_leaves_room_at_direct_walls(void **state) {
@@ -830,6 +873,7 @@ int main(int argc, char **argv) {
         cmocka_unit_test(test_sim_particle_that_leaves_is_a_status),
         cmocka_unit_test(test_sim_wild_velocities_are_a_status),
         cmocka_unit_test(test_sim_unstable_dt_is_a_status),
+        cmocka_unit_test(test_sim_limit_counts_mass_damping),
         cmocka_unit_test(test_sim_exit_leaves_room_at_direct_walls),
         cmocka_unit_test(test_sim_check_finds_faults),
         cmocka_unit_test(test_sim_check_finds_faults_of_stages),
