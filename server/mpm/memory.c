@@ -14,8 +14,8 @@
 
 void *mpm_memory(size_t bytes) {
     const size_t alignment = bytes >= HUGE ? HUGE : LINE;
-    char *memory = aligned_alloc(alignment, (bytes + LINE - 1) / LINE * LINE);
-    if (!memory) {
+    void *memory; // aligned_alloc would take whole multiples of the alignment only
+    if (posix_memalign(&memory, alignment, bytes)) {
         return NULL;
     }
 #ifdef MADV_HUGEPAGE
