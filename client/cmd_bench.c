@@ -34,11 +34,11 @@ static void print_name(void *context, const struct bench_point *point) {
 }
 
 static int list(const struct client *client, const cJSON *study) {
-    cJSON *names = client->json ? cJSON_CreateArray() : NULL;
-    bench_each(study, print_name, names);
-    if (names)
-        report_json(names);
-    cJSON_Delete(names);
+    cJSON *answer = client->json ? cJSON_CreateObject() : NULL;
+    bench_each(study, print_name, answer ? cJSON_AddArrayToObject(answer, "cases") : NULL);
+    if (answer)
+        report_json(answer);
+    cJSON_Delete(answer);
     return CLIENT_DONE;
 }
 

@@ -37,6 +37,7 @@ def test_json_of_every_command_is_json(fbar, fake, recording):
         "set": ["r1", "fbar=false"], "pause": ["r1"], "resume": ["r1"], "start": ["r1"], "step": ["r1"],
         "record": ["r1", "-o", "c.h5"], "info": ["a.h5"], "plot": ["a.h5", "-o", "a.png", "--size", "400x300"],
         "recover": ["d.h5"], "keygen": ["keys"], "completion": ["bash"], "cancel": ["r1"], "delete": ["r1"],
+        "bench": ["accuracy", "--list"],
     }  # fmt: skip
     shown = re.findall(r"^  ([a-z]+) ", fbar("help").stdout.split("examples")[0], re.M)
     assert set(lines) | {"probes"} == set(shown)

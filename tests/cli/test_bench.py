@@ -21,7 +21,7 @@ def study(*words):
 def test_bench_names_the_points_of_the_study(fbar):
     result = fbar("bench", "accuracy", "--list")
     assert result.returncode == 0 and result.stdout == study("paper", "--list")
-    assert json.loads(fbar("--json", "bench", "accuracy", "--list").stdout) == result.stdout.splitlines()
+    assert json.loads(fbar("--json", "bench", "accuracy", "--list").stdout) == {"cases": result.stdout.splitlines()}
 
 
 @pytest.mark.parametrize("words, told", [
