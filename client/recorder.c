@@ -194,7 +194,8 @@ static enum recorder_outcome wait_for_daemon(struct recorder *r) {
             return RECORDER_GOOD;
         if (recorder_connect(r) == RECORDER_GOOD) {
             terminal_note("the daemon is back");
-            recorder_acknowledge(r, r->synced_frames);
+            if (*r->name) // none yet before the log is begun
+                recorder_acknowledge(r, r->synced_frames);
             r->heard_at = 0; // poll at once
             return RECORDER_GOOD;
         }
@@ -393,9 +394,10 @@ static enum recorder_outcome start(struct recorder *r) {
     enum recorder_outcome outcome = recorder_connect(r);
     if (outcome == RECORDER_GOOD)
         outcome = recorder_get_json(r, "", &run);
-    // A recording that goes on waits as it would have done had it never stopped.
-    while (!empty && outcome == RECORDER_AWAY && !interrupt_count() &&
-           wait_for_daemon(r) == RECORDER_GOOD)
+    // A recording that goes on waits as it would have done had it never stopped; a new one waits for
+    // a daemon that was there a moment ago.
+    while (outcome == RECORDER_AWAY && (!empty || request_broken_off(r->client->requests)) &&
+           !interrupt_count() && wait_for_daemon(r) == RECORDER_GOOD)
         outcome = recorder_get_json(r, "", &run);
     if (outcome != RECORDER_GOOD) {
         if (outcome == RECORDER_AWAY)

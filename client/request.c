@@ -20,6 +20,7 @@ struct request {
     CURL *curl;
     const char *url; // borrowed
     char *authorization;
+    bool broken_off;
 };
 
 void request_reply_free(struct reply *reply) {
@@ -141,6 +142,8 @@ int request_send(struct request *request, const struct request_spec *spec, struc
     }
     const CURLcode code = curl_easy_perform(curl);
     curl_slist_free_all(headers);
+    request->broken_off = code == CURLE_SEND_ERROR || code == CURLE_RECV_ERROR ||
+                          code == CURLE_GOT_NOTHING || code == CURLE_PARTIAL_FILE;
     if (code != CURLE_OK) {
         request_reply_free(out);
         snprintf(why, why_bytes, "%s", *message ? message : curl_easy_strerror(code));
@@ -152,6 +155,10 @@ int request_send(struct request *request, const struct request_spec *spec, struc
         return -1;
     }
     return 0;
+}
+
+bool request_broken_off(const struct request *request) {
+    return request->broken_off;
 }
 
 char *request_path(const char *before, const char *id, const char *after) {

@@ -29,6 +29,10 @@ struct request_spec {
 int request_send(struct request *request, const struct request_spec *spec, struct reply *out,
                  char *why, size_t why_bytes);
 
+// Whether the last request was taken and then broken off, as by a daemon that is killed: there was
+// one, and it may come back.
+bool request_broken_off(const struct request *request);
+
 // A path with `id` escaped: request_path("/v1/runs/", id, "/frames"). The caller frees it.
 char *request_path(const char *before, const char *id, const char *after);
 

@@ -1,6 +1,8 @@
 """A killed run goes on with the same bits: every built-in scene, at another number of threads; and what does
 not repeat what was published is a new epoch, and says so."""
 import json
+import socket
+import struct
 
 import h5py
 import pytest
@@ -75,6 +77,7 @@ def test_what_does_not_repeat_itself_is_a_new_epoch(place):
     scene = merged(POOL, {"output": {"checkpoint_interval": 1e6, "interval": 0.02}, "time": {"end": 0.4}})
     daemon.create(scene, id="run", start=False, recorders=["keeper"])
     recorder = daemon.record("run", "a.h5")
+    until(lambda: len(daemon.run("run")["recorders"]) == 2)  # before, a daemon that is away ends a new recording
     daemon.act("run", "step", {"steps": 1050})  # frames 0 to 10
     daemon.wait("run", "paused")
     n = until(lambda: len(f := daemon.frames("run")) == 11 and len(f))
@@ -127,3 +130,29 @@ def test_checkpoint_that_counts_on_lost_probes_is_not_used(place):
     assert [f["digest"] for f in daemon.frames("run")] != []
 
 
+
+
+def test_new_recording_waits_for_a_daemon_that_breaks_its_first_request_off(place):
+    """A daemon that is killed while it is asked for the first time was there; one that never answered is an error."""
+    daemon = place().start()
+    daemon.create(POOL, id="run", start=False)
+    daemon.stop()
+    host, port = daemon.addresses[0].split(":")
+    nobody = daemon.record("run", "a.h5")
+    assert nobody.wait(60) == 3 and "cannot reach" in daemon.said("a.h5")
+    with socket.socket() as listener:
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.bind((host, int(port)))
+        listener.listen()
+        recorder = daemon.record("run", "b.h5")
+        taken, _ = listener.accept()
+        taken.recv(1)
+        taken.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))  # a reset, as a kill gives
+        taken.close()
+    until(lambda: "waiting up to" in daemon.said("b.h5"))
+    daemon.start()
+    until(lambda: len(daemon.run("run")["recorders"]) == 1)
+    daemon.act("run", "resume")
+    assert recorder.wait(60) == 0, daemon.said("b.h5")
+    with h5py.File(daemon.folder / "b.h5") as f:
+        assert f["fbard"].attrs["complete"] == 1
