@@ -123,12 +123,13 @@ $(B)/obj/%.$(1).o: %.c Makefile
 endef
 $(foreach level,$(LEVELS),$(eval $(call lanes_rule,$(level))))
 
-# The built-in scenes, the tables that they cite and the live page, embedded as they are: $(1) files, $(2) name of the list,
-# $(3) what a name leaves away of its path, $(4) and of its end. A scene in a folder within is called FOLDER-NAME.
-embed = $(Q){ echo '\#include "server/scenes_data.h"'; i=0; \
+# The built-in scenes, the tables that they cite, the live page and the points of `fbar bench`, embedded as they are:
+# $(1) files, $(2) name of the list, $(3) what a name leaves away of its path, $(4) and of its end. A scene in a folder
+# within is called FOLDER-NAME.
+embed = $(Q){ echo '\#include "proto/embedded.h"'; echo "extern const struct embedded $(2)[];"; i=0; \
 	for f in $(1); do echo "static const char text_$$i[] = {"; i=$$((i + 1)); \
 	od -An -v -tx1 $$f | sed "s/ \([0-9a-f][0-9a-f]\)/'\\\\x\1',/g"; echo "0};"; done; \
-	echo "const struct scenes_data $(2)[] = {"; i=0; \
+	echo "const struct embedded $(2)[] = {"; i=0; \
 	for f in $(1); do n=$${f\#\#$(3)}; n=$$(echo $${n%$(4)} | tr / -); \
 	echo "{\"$$n\", text_$$i, sizeof text_$$i - 1},"; i=$$((i + 1)); done; \
 	echo "{0, 0, 0}};"; } > $@
@@ -146,14 +147,12 @@ $(B)/gen/page_data.c: $(PAGE) Makefile
 	$(call embed,$(PAGE),page_data,*/,)
 $(CHARTJS):
 	@echo "$@ is missing: make deps installs it (Debian's libjs-chart.js), or set CHARTJS"; exit 1
-# The points of `fbar bench accuracy`.
-$(B)/gen/bench_accuracy.c: bench/accuracy.json Makefile
+$(B)/gen/bench_data.c: bench/accuracy.json Makefile
 	$(call say,EMBED,$<)
 	@mkdir -p $(@D)
-	$(Q){ echo 'extern const char bench_accuracy_json[];'; echo 'const char bench_accuracy_json[] = {'; \
-	  od -An -v -tx1 $< | sed "s/ \([0-9a-f][0-9a-f]\)/'\\\\x\1',/g"; echo '0};'; } > $@
+	$(call embed,$<,bench_data,*/,.json)
 GEN_OBJ = $(addprefix $(B)/obj/gen/,scenes_data.o tables_data.o page_data.o)
-BENCH_POINTS = $(B)/obj/gen/bench_accuracy.o
+BENCH_POINTS = $(B)/obj/gen/bench_data.o
 $(GEN_OBJ) $(BENCH_POINTS): $(B)/obj/gen/%.o: $(B)/gen/%.c
 	@mkdir -p $(@D)
 	$(Q)$(CC) $(ALL_CFLAGS) -c $< -o $@

@@ -69,7 +69,7 @@ def points(size, only=()):
             patch = composed(patch, resolved(problem.overrides, cell / math.isqrt(method["ppc"])))
             labels = {"problem": problem.name, **{k: method[k] for k in ("basis", "scheme", "cfl", "ppc", "blend")}, "cell": cell}
             name = "-".join(v if isinstance(v, str) else f"{v:g}" for v in labels.values())
-            yield problem, {"name": name, **labels}, Point(problem.scene, patch, problem.samples)
+            yield problem, {"name": name, **labels}, Point(problem.scene, patch, problem.samples, 120 if size == "small" else 1200)
 
 
 def interpolated(rows, time):

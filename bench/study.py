@@ -1,5 +1,5 @@
 """Many small runs of one kind: a table of points, each a scene with a patch, run by build/release/runner, as many
-at a time as there are cores, and kept, so that what is done is not done again.
+at a time as there are cores (or JOBS), and kept, so that what is done is not done again.
 
 A point that crashes, hangs or ends in values that are not finite without saying so is a bug of the solver, and is
 reported as one; a run that fails as a run may (the daemon's `failed`) is a result.
@@ -15,7 +15,8 @@ import subprocess
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 RUNNER = pathlib.Path(os.environ.get("RUNNER") or ROOT / "build" / "release" / "runner")
-HANG = 900  # s of wall time for one point; --seconds ends a run that is merely slow
+HANG = 10  # s of wall time for each of the processor that a point may take, and 900: --seconds ends what is merely slow
+JOBS = int(os.environ.get("JOBS") or len(os.sched_getaffinity(0)))  # points at a time
 SCHEMES = {"standard": False, "zhao": True, "anchored": {"scheme": "anchored"}}
 BASES = ("linear", "gimp", "bspline2", "bspline3")
 
@@ -65,9 +66,10 @@ def run(point):
     if point.steps:
         command += ["--steps", str(point.steps)]
     try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=HANG)
+        hang = 900 + HANG * point.seconds
+        done = subprocess.run(command, capture_output=True, text=True, timeout=hang)
     except subprocess.TimeoutExpired:
-        return {"outcome": "bug", "bug": f"no end after {HANG} s"}
+        return {"outcome": "bug", "bug": f"no end after {hang:g} s"}
     if done.returncode == 2:
         return {"outcome": "refused", "detail": done.stderr.strip()}
     try:
@@ -80,28 +82,32 @@ def run(point):
 
 
 class Store:
-    """Results by the key of their point: one line of JSON each in FILE. They hold for one build of the solver; a
-    program that is newer than the file starts it anew."""
+    """Results by the key of their point: one line of JSON each in FILE, whose first line says which program they are
+    of. They hold for one build of the solver; another program starts the file anew."""
 
     def __init__(self, file):
         self.file, self.results = file, {}
+        program = json.dumps(["runner", hashlib.sha256(RUNNER.read_bytes()).hexdigest()])
+        lines = file.read_text().splitlines() if file.exists() else []
+        kept = [program]
+        for line in lines[1:] if lines[:1] == [program] else []:
+            try:
+                key, result = json.loads(line)
+            except ValueError:
+                continue  # the line that a kill cut
+            self.results[key] = result
+            kept.append(line)
         file.parent.mkdir(parents=True, exist_ok=True)
-        if file.exists() and file.stat().st_mtime < RUNNER.stat().st_mtime:
-            file.unlink()
-        if file.exists():
-            for line in file.read_text().splitlines():
-                try:
-                    key, result = json.loads(line)
-                except ValueError:
-                    continue  # the line that a kill cut
-                self.results[key] = result
+        scratch = file.with_suffix(".new")
+        scratch.write_text("".join(line + "\n" for line in kept))
+        scratch.replace(file)
 
     def all(self, points, jobs=None, say=None):
         """The result of every point, in order."""
         texts = {p.scene: scene_path(p.scene).read_text() for p in points}
         keys = [p.key(texts[p.scene]) for p in points]
         todo = {k: p for k, p in zip(keys, points) if k not in self.results}
-        with concurrent.futures.ThreadPoolExecutor(jobs or os.cpu_count()) as pool, self.file.open("a") as kept:
+        with concurrent.futures.ThreadPoolExecutor(jobs or JOBS) as pool, self.file.open("a") as kept:
             waiting = {pool.submit(run, p): k for k, p in todo.items()}
             for n, future in enumerate(concurrent.futures.as_completed(waiting), 1):
                 key = waiting[future]

@@ -7,13 +7,14 @@
 #include <string.h>
 
 #include "client/terminal.h"
+#include "proto/embedded.h"
 
-extern const char bench_accuracy_json[]; // Makefile
+extern const struct embedded bench_data[]; // accuracy: the Makefile
 
 static const char *const schemes[] = {"standard", "zhao", "anchored"};
 
 cJSON *bench_study(void) {
-    cJSON *study = cJSON_Parse(bench_accuracy_json);
+    cJSON *study = cJSON_Parse(bench_data[0].text);
     if (!study)
         terminal_error("no memory");
     return study;

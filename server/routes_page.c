@@ -35,7 +35,7 @@ static const char *type_of(const char *name) {
 
 void routes_serve_page(struct call *c) {
     const char *name = c->names[0][0] != '\0' ? c->names[0] : "page.html";
-    const struct scenes_data *file = page_data;
+    const struct embedded *file = page_data;
     while (file->name != NULL && strcmp(file->name, name) != 0)
         file++;
     if (file->name == NULL) {

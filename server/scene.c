@@ -686,6 +686,7 @@ static bool read_definition(struct scene *scene) {
     def->memory_limit = physical_memory();
     def->wants_displacement = wants(root, MPM_FIELD_DISPLACEMENT);
     def->wants_volume_ratio = wants(root, MPM_FIELD_VOLUME_RATIO);
+    def->wants_mean_stress_smooth = wants(root, MPM_FIELD_MEAN_STRESS_SMOOTH);
     return read_materials(scene) && read_bodies(scene) && read_walls(scene) && read_loads(scene) &&
            read_rigid_bodies(scene) && read_stages(scene) && read_probes(scene) &&
            read_references(scene);

@@ -34,7 +34,7 @@ static void read_names(const char *line, struct scene_table *out) {
 
 bool scene_table_read(const char *name, struct scene_table *out) {
     *out = (struct scene_table){0};
-    const struct scenes_data *data = tables_data;
+    const struct embedded *data = tables_data;
     while (data->name && strcmp(data->name, name) != 0)
         data++;
     if (!data->name)

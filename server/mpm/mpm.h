@@ -348,6 +348,7 @@ struct mpm_def {
     bool wants_displacement; // a frame will ask for it
     bool
         wants_volume_ratio; // a frame will ask for the raw volume ratio, also of fluids under F-bar
+    bool wants_mean_stress_smooth; // a frame will ask for it; counted in the estimate of memory
     size_t memory_limit;    // bytes, 0 = none
     int n_threads;          // >= 1; results do not depend on it
     enum mpm_isa isa;       // of the kernels; another one changes results by round-off only

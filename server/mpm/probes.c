@@ -16,6 +16,10 @@ static bool takes_field(enum mpm_probe_kind kind) {
            kind == MPM_PROBE_MEAN;
 }
 
+bool mpm_probe_reads(const struct mpm_probe_def *q, enum mpm_field field) {
+    return (takes_field(q->kind) || q->kind == MPM_PROBE_ERROR) && q->field == (int)field;
+}
+
 size_t mpm_probe_components(const struct mpm_sim *sim, size_t probe) {
     const struct mpm_probe_def *q = &sim->def->probes[probe];
     if (takes_field(q->kind)) {
@@ -186,8 +190,7 @@ static void particle_field(const struct mpm_sim *sim, size_t probe, enum mpm_fie
 static void present_value(struct mpm_sim *sim, size_t probe, double *out) {
     const struct mpm_probe_def *q = &sim->def->probes[probe];
     struct mpm_balance balance;
-    if ((takes_field(q->kind) || q->kind == MPM_PROBE_ERROR) &&
-        q->field == MPM_FIELD_MEAN_STRESS_SMOOTH) {
+    if (mpm_probe_reads(q, MPM_FIELD_MEAN_STRESS_SMOOTH)) {
         mpm_smooth_update(sim);
     }
     switch (q->kind) {

@@ -281,6 +281,14 @@ static bool wants_J_raw(const struct mpm_def *def) {
     return wanted;
 }
 
+static bool wants_smooth(const struct mpm_def *def) {
+    bool wanted = def->wants_mean_stress_smooth;
+    for (size_t k = 0; k < def->n_probes; k++) {
+        wanted |= mpm_probe_reads(&def->probes[k], MPM_FIELD_MEAN_STRESS_SMOOTH);
+    }
+    return wanted;
+}
+
 static bool wants_places(const struct mpm_def *def) {
     bool follows = def->n_loads > 0;
     for (size_t k = 0; k < def->n_probes; k++) {
@@ -598,6 +606,10 @@ void mpm_estimate(const struct mpm_def *def, struct mpm_estimate *out) {
     out->nodes = (size_t)(c.grid.n_slots - 1) * (size_t)MPM_BLOCK_NODES(def->dimension);
     out->bytes += mpm_grid_bytes(&c.grid, c.grid.n_slots, mpm_fbar_scalars(widest_fbar(def))) +
                   mpm_sorter_bytes(largest, def->n_threads);
+    if (wants_smooth(
+            def)) { // of the nodes it takes those that particles reach: fewer than blocks have
+        out->bytes += mpm_smooth_estimate(out->nodes, out->particles);
+    }
     for (size_t k = 0; k < def->n_rigids; k++) {
         out->bytes += mpm_rigid_bytes(&def->rigids[k], def->dimension, out->particles);
     }

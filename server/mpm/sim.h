@@ -114,6 +114,8 @@ bool mpm_provide_fbar(struct mpm_sim *sim, enum mpm_fbar_scheme scheme);
 void mpm_particle_field(const struct mpm_particles *s, size_t p, enum mpm_field field, double *out);
 // The medium that an error probe's solution is for: that of its body in the last stage.
 struct mpm_medium mpm_probe_medium(const struct mpm_def *def, const struct mpm_probe_def *q);
+// Whether the probe's value is made of the field.
+bool mpm_probe_reads(const struct mpm_probe_def *q, enum mpm_field field);
 // Finds the particles of the probes that follow one.
 void mpm_probes_find_particles(struct mpm_sim *sim);
 // Adds the present values to the running integrals of the probes that average.

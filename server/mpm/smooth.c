@@ -166,3 +166,12 @@ void mpm_smooth_free(struct mpm_smooth *m) {
 size_t mpm_smooth_bytes(const struct mpm_smooth *m) {
     return m->capacity * sizeof *m->nodes;
 }
+
+size_t mpm_smooth_estimate(size_t n_nodes, size_t n_particles) {
+    size_t capacity = FIRST_CAPACITY, before = 0;
+    while (2 * (n_nodes + MPM_MAX_STENCIL) > capacity) { // as look_around has it
+        before = capacity;
+        capacity *= 2;
+    }
+    return (capacity + before) * sizeof(struct mpm_smooth_node) + n_particles * sizeof(double);
+}

@@ -23,4 +23,7 @@ struct mpm_smooth {
 // there is none for them either, `value` is NULL.
 void mpm_smooth_update(const struct mpm_sim *sim);
 void mpm_smooth_free(struct mpm_smooth *smooth);
+// What is held now; and what will be for n_particles that reach n_nodes, while the table grows to
+// that.
 size_t mpm_smooth_bytes(const struct mpm_smooth *smooth);
+size_t mpm_smooth_estimate(size_t n_nodes, size_t n_particles);

@@ -366,6 +366,39 @@ static void test_body_force_moves_as_gravity_does(void **state) {
     }
 }
 
+// A daemon admits runs by the estimate, so it must not be short of what the smooth mean stress
+// takes, nor beyond a table of all nodes in the blocks: a power of two of places that is at most
+// half full, beside the half as large one that it grew from, is less than 6 places a node.
+static void test_smooth_mean_stress_is_in_the_estimate(void **state) {
+    (void)state;
+    for (int dim = 2; dim <= 3; dim++) {
+        for (int by_probe = 0; by_probe < 2; by_probe++) {
+            define(dim);
+            struct mpm_estimate without, with;
+            mpm_estimate(&world.def, &without);
+            struct mpm_probe_def *mean = add_probe(MPM_PROBE_MEAN, -1);
+            mean->field = by_probe ? MPM_FIELD_MEAN_STRESS_SMOOTH : MPM_FIELD_MEAN_STRESS;
+            world.def.wants_mean_stress_smooth = !by_probe;
+            mpm_estimate(&world.def, &with);
+            struct mpm_sim *sim = create();
+            const size_t before = mpm_bytes(sim);
+            double *field = malloc(mpm_n_particles(sim) * sizeof *field);
+            assert_non_null(field);
+            if (by_probe) {
+                assert_true(isfinite(value(sim, 0)));
+            } else {
+                mpm_field_copy(sim, MPM_FIELD_MEAN_STRESS_SMOOTH, field);
+            }
+            free(field);
+            const size_t taken = mpm_bytes(sim) - before, told = with.bytes - without.bytes;
+            assert_true(taken >= mpm_n_particles(sim) * sizeof(double));
+            assert_in_range(told, taken,
+                            mpm_n_particles(sim) * sizeof(double) + 6 * (with.nodes + 64) * 32);
+            mpm_free(sim);
+        }
+    }
+}
+
 static void test_body_force_of_a_vortex_follows_its_matter(void **state) {
     (void)state;
     define(2);
@@ -748,6 +781,7 @@ int main(int argc, char **argv) {
         cmocka_unit_test(test_probe_error_by_every_norm),
         cmocka_unit_test(test_probe_error_of_a_column),
         cmocka_unit_test(test_body_force_moves_as_gravity_does),
+        cmocka_unit_test(test_smooth_mean_stress_is_in_the_estimate),
         cmocka_unit_test(test_body_force_of_a_vortex_follows_its_matter),
         cmocka_unit_test(test_probe_folds_a_field),
         cmocka_unit_test(test_probe_energy_and_momentum_are_the_balance),

@@ -1215,6 +1215,7 @@ static void test_scene_puts_position_first(void **state) {
         assert_int_equal(output->fields[0], MPM_FIELD_POSITION);
         assert_int_equal(output->fields[1], MPM_FIELD_VOLUME_RATIO);
         assert_true(scene_def(scene)->wants_volume_ratio);
+        assert_false(scene_def(scene)->wants_mean_stress_smooth);
         scene_free(scene);
     }
     struct scene *scene = create("{\"output\":{\"fields\":[]},\"stages\":[]}");
