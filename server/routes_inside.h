@@ -72,6 +72,9 @@ const char *routes_type_name(const cJSON *item);
 // {"scene": name or object, "overrides": object}, checked by bodies_check: the merged scene, new;
 // NULL with faults.
 cJSON *routes_merged_scene(const cJSON *body, struct faults *faults);
-// A scene that is valid and fits in memory; NULL with faults, whose pointers begin with `prefix`.
-struct scene *routes_checked_scene(const struct call *c, const cJSON *json, const char *prefix,
-                                   struct mpm_estimate *estimate, struct faults *faults);
+// scene_read and scene_examine with this daemon's limit of memory and the pointers of faults below
+// `prefix`.
+struct scene *routes_read_scene(const struct call *c, const cJSON *json, const char *prefix,
+                                struct faults *faults);
+bool routes_examine_scene(const struct call *c, struct scene *scene, const char *prefix,
+                          struct faults *faults);

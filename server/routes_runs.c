@@ -327,29 +327,13 @@ static void reply_created(struct call *c, struct run *run, bool again) {
     run_release(run);
 }
 
-void routes_serve_create(struct call *c) {
+// The reply to a request for a run that was not made now.
+static void reply_not_made(struct call *c, enum runs_result result, struct run *run,
+                           const struct run_definition *definition, const char *why) {
     struct faults faults = {0};
-    struct run_definition definition = {0};
-    struct mpm_estimate estimate;
-    struct run *run = NULL, *twin = NULL;
-    char why[JOURNAL_WHY] = "", digest[JSON_DIGEST];
-    if (!idempotency(c, &definition, digest))
-        return;
-    read_create(c->body, &definition, &faults);
-    cJSON *merged = routes_merged_scene(c->body, &faults);
-    struct scene *scene =
-        merged != NULL ? routes_checked_scene(c, merged, "/scene", &estimate, &faults) : NULL;
-    if (scene == NULL || faults.count > 0) {
-        reply_faults(c->reply, 422, &faults);
-        goto done;
-    }
-    const char *named = cJSON_GetStringValue(json_member(c->body, "scene"));
-    definition.name = named != NULL ? named : scene_title(scene);
-    definition.scene = scene;
-    switch (runs_add(c->routes->runs, &definition, &run, why)) {
+    struct run *twin = NULL;
+    switch (result) {
     case RUNS_CREATED:
-        scene = NULL;
-        reply_created(c, run, false);
         break;
     case RUNS_THERE:
         reply_created(c, run, true);
@@ -360,7 +344,7 @@ void routes_serve_create(struct call *c) {
         reply_faults(c->reply, 422, &faults);
         break;
     case RUNS_DUPLICATE:
-        twin = runs_find(c->routes->runs, definition.id);
+        twin = runs_find(c->routes->runs, definition->id);
         reply_problem(c->reply, 409, NULL, "%s, and it is %s", why,
                       twin != NULL ? run_state_name(run_status(twin).state) : "gone by now");
         run_release(twin);
@@ -374,7 +358,52 @@ void routes_serve_create(struct call *c) {
         reply_problem(c->reply, 507, NULL, "%s", why);
         break;
     }
-done:
+    faults_free(&faults);
+}
+
+// What is quick to tell goes first: a repeated request is answered whatever its scene would be
+// judged today, and no shape is filled for a run that there is no place for.
+void routes_serve_create(struct call *c) {
+    struct faults faults = {0};
+    struct run_definition definition = {0};
+    struct run *run = NULL;
+    cJSON *merged = NULL;
+    struct scene *scene = NULL;
+    enum runs_result result;
+    char why[JOURNAL_WHY] = "", digest[JSON_DIGEST];
+    if (!idempotency(c, &definition, digest))
+        return;
+    if (definition.key != NULL) {
+        result = runs_admit(c->routes->runs, &definition, &run, why);
+        if (result == RUNS_THERE || result == RUNS_KEY_REUSED) {
+            reply_not_made(c, result, run, &definition, why);
+            return;
+        }
+    }
+    read_create(c->body, &definition, &faults);
+    merged = routes_merged_scene(c->body, &faults);
+    if (merged != NULL)
+        scene = routes_read_scene(c, merged, "/scene", &faults);
+    result = scene != NULL && faults.count == 0
+                 ? runs_admit(c->routes->runs, &definition, &run, why)
+                 : RUNS_CREATED;
+    if (result != RUNS_CREATED) {
+        reply_not_made(c, result, run, &definition, why);
+    } else if (scene == NULL || !routes_examine_scene(c, scene, "/scene", &faults) ||
+               faults.count > 0) {
+        reply_faults(c->reply, 422, &faults);
+    } else {
+        const char *named = cJSON_GetStringValue(json_member(c->body, "scene"));
+        definition.name = named != NULL ? named : scene_title(scene);
+        definition.scene = scene;
+        result = runs_add(c->routes->runs, &definition, &run, why);
+        if (result == RUNS_CREATED) {
+            scene = NULL;
+            reply_created(c, run, false);
+        } else {
+            reply_not_made(c, result, run, &definition, why);
+        }
+    }
     scene_free(scene);
     cJSON_Delete(merged);
     faults_free(&faults);

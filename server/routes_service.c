@@ -182,28 +182,22 @@ cJSON *routes_merged_scene(const cJSON *body, struct faults *faults) {
     return merged;
 }
 
-// A scene that is valid and fits in memory; NULL with faults.
-struct scene *routes_checked_scene(const struct call *c, const cJSON *json, const char *prefix,
-                                   struct mpm_estimate *estimate, struct faults *faults) {
+struct scene *routes_read_scene(const struct call *c, const cJSON *json, const char *prefix,
+                                struct faults *faults) {
     struct faults inner = {0};
-    struct scene *scene = scene_create(json, &inner);
+    struct scene *scene = scene_read(json, c->routes->host->memory_limit, &inner);
     faults_below(faults, prefix, &inner);
     faults_free(&inner);
-    if (scene == NULL)
-        return NULL;
-    mpm_estimate(scene_def(scene), estimate);
-    size_t limit = c->routes->host->memory_limit;
-    if (estimate->bytes > limit) {
-        char expected[64], actual[64];
-        snprintf(expected, sizeof expected, "<= %zu bytes", limit);
-        snprintf(actual, sizeof actual, "%zu bytes", estimate->bytes);
-        faults_add(faults, prefix, "memory", expected, actual,
-                   "%zu particles and %zu nodes need %zu bytes; this daemon gives %zu",
-                   estimate->particles, estimate->nodes, estimate->bytes, limit);
-        scene_free(scene);
-        return NULL;
-    }
     return scene;
+}
+
+bool routes_examine_scene(const struct call *c, struct scene *scene, const char *prefix,
+                          struct faults *faults) {
+    struct faults inner = {0};
+    const bool valid = scene_examine(scene, c->routes->host->memory_limit, &inner);
+    faults_below(faults, prefix, &inner);
+    faults_free(&inner);
+    return valid;
 }
 
 // What a run of the scene would be warned of.
@@ -218,20 +212,21 @@ static void add_warnings(cJSON *json, struct scene *scene, const struct mpm_esti
 
 void routes_serve_validate(struct call *c) {
     struct faults faults = {0};
-    struct mpm_estimate estimate;
     bool bare = json_member(c->body, "scene") == NULL;
     cJSON *merged = NULL;
     if (!bare) {
         bodies_check(c->route->request, c->body, &faults);
         merged = routes_merged_scene(c->body, &faults);
     }
+    const char *prefix = bare ? "" : "/scene";
     struct scene *scene = NULL;
     if (bare || merged != NULL)
-        scene = routes_checked_scene(c, bare ? c->body : merged, bare ? "" : "/scene", &estimate,
-                                     &faults);
-    if (scene == NULL || faults.count > 0) {
+        scene = routes_read_scene(c, bare ? c->body : merged, prefix, &faults);
+    if (scene == NULL || !routes_examine_scene(c, scene, prefix, &faults) || faults.count > 0) {
         reply_faults(c->reply, 422, &faults);
     } else {
+        struct mpm_estimate estimate;
+        mpm_estimate(scene_def(scene), &estimate);
         cJSON *json = cJSON_CreateObject(), *costs;
         cJSON_AddTrueToObject(json, "valid");
         costs = cJSON_AddObjectToObject(json, "estimate");

@@ -187,6 +187,31 @@ static struct run *made_with_key(const struct runs *s, const char *key) {
     return NULL;
 }
 
+// Under the lock.
+static enum runs_result admit(const struct runs *s, const struct run_definition *definition,
+                              const char *id, struct run **out, char *why) {
+    struct run *earlier = made_with_key(s, definition->key);
+    if (earlier == NULL)
+        return admission(s, id, why);
+    if (strcmp(run_request(earlier), definition->request) == 0) {
+        *out = earlier;
+        run_retain(earlier);
+        return RUNS_THERE;
+    }
+    snprintf(why, JOURNAL_WHY, "the key was used already, with another body, for run %s",
+             run_id(earlier));
+    return RUNS_KEY_REUSED;
+}
+
+enum runs_result runs_admit(struct runs *s, const struct run_definition *definition,
+                            struct run **out, char *why) {
+    pthread_mutex_lock(&s->lock);
+    const enum runs_result result =
+        admit(s, definition, definition->id != NULL ? definition->id : "", out, why);
+    pthread_mutex_unlock(&s->lock);
+    return result;
+}
+
 enum runs_result runs_add(struct runs *s, const struct run_definition *definition, struct run **out,
                           char *why) {
     char id[RUN_ID_MAX + 1];
@@ -200,19 +225,7 @@ enum runs_result runs_add(struct runs *s, const struct run_definition *definitio
     else
         snprintf(id, sizeof id, "%s", definition->id);
     named.id = id;
-    enum runs_result result;
-    struct run *earlier = made_with_key(s, definition->key);
-    if (earlier == NULL) {
-        result = admission(s, id, why);
-    } else if (strcmp(run_request(earlier), definition->request) == 0) {
-        result = RUNS_THERE;
-        *out = earlier;
-        run_retain(earlier);
-    } else {
-        result = RUNS_KEY_REUSED;
-        snprintf(why, JOURNAL_WHY, "the key was used already, with another body, for run %s",
-                 run_id(earlier));
-    }
+    enum runs_result result = admit(s, definition, id, out, why);
     pthread_mutex_unlock(&s->lock);
     if (result == RUNS_CREATED) {
         bool storage;

@@ -23,6 +23,11 @@ enum runs_result {
     RUNS_MEMORY,
     RUNS_STOPPED,
 };
+// What runs_add would say now of a run with this key and id (NULL: none; then no id is taken), as
+// far as that is known without its scene: RUNS_CREATED where nothing speaks against it. Of `out`
+// and `why` the same holds, but that nothing is made.
+enum runs_result runs_admit(struct runs *runs, const struct run_definition *definition,
+                            struct run **out, char *why);
 // On RUNS_CREATED and RUNS_THERE `out` is retained for the caller; on RUNS_CREATED the scene is the
 // run's; else the scene stays the caller's and `why` (JOURNAL_WHY bytes) says why. An id of NULL
 // has one made from the name.

@@ -749,34 +749,31 @@ static bool prune(cJSON *json, const struct faults *faults, size_t from) {
 
 // The solver's faults of a scene that has others: as far as it can be built without what is at
 // fault.
-static void check_rest(const cJSON *json, struct faults *faults, size_t from) {
+static void check_rest(const cJSON *json, size_t memory_limit, struct faults *faults, size_t from) {
     struct faults left = {0};
     struct scene *scene = calloc(1, sizeof *scene);
     if (scene && (scene->json = cJSON_Duplicate(json, true)) && cJSON_IsObject(scene->json) &&
         prune(scene->json, faults, from)) {
         scene_check(scene->json, &left);
         if (left.count + left.more == 0 && read_definition(scene))
-            mpm_check(&scene->def, report, faults);
+            scene_examine(scene, memory_limit, faults);
     }
     faults_free(&left);
     scene_free(scene);
 }
 
-struct scene *scene_create(const cJSON *json, struct faults *faults) {
+struct scene *scene_read(const cJSON *json, size_t memory_limit, struct faults *faults) {
     size_t before = faults->count + faults->more, first = faults->count;
     struct scene *scene = calloc(1, sizeof *scene);
     if (!scene || !(scene->json = cJSON_Duplicate(json, true)))
         goto out_of_memory;
     scene_check(scene->json, faults);
     if (faults->count + faults->more == before) {
-        if (!read_definition(scene))
-            goto out_of_memory;
-        mpm_check(&scene->def, report, faults);
-    } else {
-        check_rest(json, faults, first);
+        if (read_definition(scene))
+            return scene;
+        goto out_of_memory;
     }
-    if (faults->count + faults->more == before)
-        return scene;
+    check_rest(json, memory_limit, faults, first);
     scene_free(scene);
     return NULL;
 
@@ -784,6 +781,23 @@ out_of_memory:
     faults_add(faults, "", "memory", NULL, NULL, "no memory for the scene");
     scene_free(scene);
     return NULL;
+}
+
+bool scene_examine(struct scene *scene, size_t memory_limit, struct faults *faults) {
+    const size_t limit = scene->def.memory_limit;
+    scene->def.memory_limit = memory_limit;
+    const bool valid = mpm_check(&scene->def, report, faults) == 0;
+    scene->def.memory_limit = limit;
+    return valid;
+}
+
+struct scene *scene_create(const cJSON *json, struct faults *faults) {
+    struct scene *scene = scene_read(json, 0, faults);
+    if (scene && !scene_examine(scene, 0, faults)) {
+        scene_free(scene);
+        return NULL;
+    }
+    return scene;
 }
 
 void scene_free(struct scene *scene) {

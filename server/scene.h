@@ -36,6 +36,12 @@ struct scene; // a valid scene: definition, output, references, and its JSON
 // Checks `json` against the table and the solver's own checks (mpm_check), and adds every fault.
 // NULL when there is any. `json` is copied.
 struct scene *scene_create(const cJSON *json, struct faults *faults);
+// The same in two halves. The first holds it against the table only, quickly; it adds the solver's
+// faults where the table finds some, so that all are told at once. The second asks the solver, who
+// fills the shapes with particles; what would need more than `memory_limit` bytes (0: any) is a
+// fault. False with faults; then the scene is still the caller's.
+struct scene *scene_read(const cJSON *json, size_t memory_limit, struct faults *faults);
+bool scene_examine(struct scene *scene, size_t memory_limit, struct faults *faults);
 void scene_free(struct scene *scene);
 
 struct mpm_def *scene_def(

@@ -11,6 +11,8 @@
 #define MAX_PARTICLES 2000000000.0 // ids are 32 bits
 #define MAX_NODES 1e9  // with whole blocks of 4 a direction, node numbers still fit 32 bits
 #define MAX_STEPS 1e15 // beyond it doubles soon no longer count one by one
+#define MADE_OF                                                                                    \
+    4 // times that a body is filled: to check it, for two estimates, and as a run begins
 #define NODE_PLANE_TOLERANCE 1e-6 // cells: round-off of a wall's place, far below any offset meant
 
 static double largest_speed(const struct mpm_def *def) {
@@ -178,6 +180,51 @@ static void check_material(struct report *r, const struct mpm_material_def *m, c
     }
 }
 
+// ---- Work ---------------------------------------------------------------------------------------
+
+bool mpm_check_affords(struct report *r, double looks) {
+    r->looks += looks;
+    if (r->looks > MPM_MAX_LOOKS && !r->exhausted) {
+        r->exhausted = true;
+        FAULT(
+            r, MPM_ERR_WORK, "",
+            TEXT("at most %.0e looks of a lattice point at a shape", MPM_MAX_LOOKS),
+            TEXT("about %.2g so far", r->looks),
+            "it would take too long to check the scene: more than %.0e looks of a lattice point at "
+            "a shape; use fewer shapes, corners, bodies, loads or probes, or fewer particles",
+            MPM_MAX_LOOKS);
+    }
+    return !r->exhausted;
+}
+
+struct search {
+    bool (*takes)(void *context, const double *x);
+    void *context;
+    bool found;
+};
+
+static bool search_on(void *context, const double *x, double volume) {
+    struct search *s = context;
+    (void)volume;
+    s->found = !s->takes || s->takes(s->context, x);
+    return !s->found;
+}
+
+bool mpm_check_finds(struct report *r, const struct mpm_def *def, const struct mpm_body_def *body,
+                     const struct mpm_sieve *sieve, double looks_each,
+                     bool (*takes)(void *context, const double *x), void *context) {
+    const double looks = (1 + looks_each) * mpm_seed_looks(def, body, sieve);
+    struct search search = {.takes = takes, .context = context};
+    if (!mpm_check_affords(r, looks)) {
+        return true;
+    }
+    mpm_seed_sifted(def, body, sieve, search_on, &search);
+    if (search.found) { // mostly at once
+        r->looks -= looks;
+    }
+    return search.found;
+}
+
 // ---- Shapes -------------------------------------------------------------------------------------
 
 // > 0 where c lies left of the way from a to b, 0 on their line.
@@ -192,6 +239,11 @@ static bool is_between(const double *a, const double *b, const double *c) {
 }
 
 static bool segments_meet(const double *a, const double *b, const double *c, const double *d) {
+    for (int k = 0; k < 2; k++) { // most pairs are far apart
+        if (fmax(a[k], b[k]) < fmin(c[k], d[k]) || fmax(c[k], d[k]) < fmin(a[k], b[k])) {
+            return false;
+        }
+    }
     const double abc = turn(a, b, c), abd = turn(a, b, d), cda = turn(c, d, a), cdb = turn(c, d, b);
     if (((abc > 0 && abd < 0) || (abc < 0 && abd > 0)) &&
         ((cda > 0 && cdb < 0) || (cda < 0 && cdb > 0))) {
@@ -230,6 +282,9 @@ static void check_polygon(struct report *r, const struct mpm_shape *shape, const
                   (i + 1) % n);
             return;
         }
+    }
+    if (!mpm_check_affords(r, (double)n * (double)n)) {
+        return;
     }
     if (area == 0) {
         FAULT(r, MPM_ERR_EMPTY, pointer, "a polygon with an area", "0 m^2",
@@ -318,9 +373,7 @@ static void check_shape(struct report *r, const struct mpm_shape *shape, const c
 
 struct outside {
     const struct mpm_def *def;
-    const struct mpm_shape *other;
-    struct mpm_region *region; // the same, made ready; NULL without memory
-    size_t out_of_domain, beyond_wall, in_other, bad_volume;
+    size_t out_of_domain, beyond_wall, bad_volume;
     int wall;
     double unit;
 };
@@ -372,14 +425,6 @@ static bool look_at(void *context, const double *x, double volume) {
     return true;
 }
 
-static bool look_in_other(void *context, const double *x, double volume) {
-    (void)volume;
-    struct outside *o = context;
-    o->in_other += o->region ? mpm_region_contains(o->region, x)
-                             : mpm_shape_contains(o->other, x, o->def->dimension, o->unit);
-    return true;
-}
-
 static bool boxes_meet(const struct mpm_shape *a, const struct mpm_shape *b, int dim) {
     double a0[MPM_MAX_DIM], a1[MPM_MAX_DIM], b0[MPM_MAX_DIM], b1[MPM_MAX_DIM];
     bool meet = mpm_shape_bounds(a, dim, a0, a1) && mpm_shape_bounds(b, dim, b0, b1);
@@ -427,6 +472,10 @@ static bool check_body(struct report *r, const struct mpm_def *def, size_t b, do
     struct outside o = {.def = def, .unit = def->cell / 2 / body->particles_per_direction};
     // One by one only where something can be wrong with a particle.
     const bool clear = body->shape.kind != MPM_SHAPE_POINTS && surely_inside(def, &body->shape);
+    if (!mpm_check_affords(r, MADE_OF * mpm_seed_looks(def, body, NULL) +
+                                  (clear ? 0 : bound * (double)def->n_walls))) {
+        return true;
+    }
     const size_t n = mpm_seed(def, body, clear ? NULL : look_at, &o);
     const char *place = body->shape.kind == MPM_SHAPE_POINTS ? "/shape/points" : "/shape";
     if (n == 0) {
@@ -454,19 +503,21 @@ static bool check_body(struct report *r, const struct mpm_def *def, size_t b, do
               o.bad_volume, body->name);
     }
     for (size_t a = 0; a < b; a++) {
-        o.other = &def->bodies[a].shape;
-        o.in_other = 0;
-        if (boxes_meet(o.other, &body->shape, def->dimension)) {
-            o.region = mpm_region_create(o.other, def->dimension, o.unit);
-            mpm_seed(def, body, look_in_other, &o);
-            mpm_region_free(o.region);
+        const struct mpm_sieve inside = {
+            .shape = &def->bodies[a].shape, .margin = o.unit, .inside = true};
+        if (!boxes_meet(inside.shape, &body->shape, def->dimension)) {
+            continue;
         }
-        if (o.in_other) {
+        if (!mpm_check_affords(r, mpm_seed_looks(def, body, &inside))) {
+            return true;
+        }
+        const size_t n_inside = mpm_seed_sifted(def, body, &inside, NULL, NULL);
+        if (n_inside) {
             FAULT(r, MPM_ERR_CONFLICT, TEXT("/bodies/%s%s", body->name, place),
                   TEXT("outside body '%s'", def->bodies[a].name),
-                  TEXT("%zu particles inside it", o.in_other),
+                  TEXT("%zu particles inside it", n_inside),
                   "bodies '%s' and '%s' overlap: %zu particles of one lie inside the other",
-                  def->bodies[a].name, body->name, o.in_other);
+                  def->bodies[a].name, body->name, n_inside);
         }
     }
     return true;
@@ -534,47 +585,53 @@ static void check_load(struct report *r, const struct mpm_def *def, const struct
     }
 }
 
-struct reach {
-    const struct mpm_def *def;
+struct round {
     const struct mpm_load_def *load;
-    size_t in_box;
-    double least, most; // radius, m
+    int dim;
+    double inner, outer; // radii, m
 };
 
-static bool look_at_load(void *context, const double *x, double volume) {
-    (void)volume;
-    struct reach *o = context;
-    bool in = true;
+static bool is_in_ring(void *context, const double *x) {
+    const struct round *o = context;
     double radius = 0;
-    for (int d = 0; d < o->def->dimension; d++) {
-        in &= x[d] >= o->load->box_min[d] && x[d] <= o->load->box_max[d];
-        if (o->def->dimension == 2 || d != o->load->axis) {
+    for (int d = 0; d < o->dim; d++) {
+        if (o->dim == 2 || d != o->load->axis) {
             radius = hypot(radius, x[d] - o->load->centre[d]);
         }
     }
-    o->in_box += in;
-    o->least = fmin(o->least, radius);
-    o->most = fmax(o->most, radius);
-    return true;
+    return radius >= o->inner && radius < o->outer;
 }
 
 // What the load finds among the particles of its body, which has some.
 static void check_load_particles(struct report *r, const struct mpm_def *def,
                                  const struct mpm_load_def *q) {
     const struct mpm_body_def *body = &def->bodies[q->body];
-    struct reach o = {.def = def, .load = q, .least = INFINITY};
-    if (!q->has_box && !(q->round && q->is_pressure)) {
-        return; // there always is an outermost particle
+    struct mpm_sieve sieve = {.has_box = true};
+    if (q->has_box) {
+        memcpy(sieve.min, q->box_min, sizeof sieve.min);
+        memcpy(sieve.max, q->box_max, sizeof sieve.max);
+        if (!mpm_check_finds(r, def, body, &sieve, 0, NULL, NULL)) {
+            FAULT(r, MPM_ERR_EMPTY, TEXT("/loads/%s/select", q->name), "at least one particle", "0",
+                  "load '%s' selects no particle of body '%s'", q->name, body->name);
+        }
+        return;
     }
-    mpm_seed(def, body, look_at_load, &o);
-    if (q->has_box && o.in_box == 0) {
-        FAULT(r, MPM_ERR_EMPTY, TEXT("/loads/%s/select", q->name), "at least one particle", "0",
-              "load '%s' selects no particle of body '%s'", q->name, body->name);
+    if (!(q->round && q->is_pressure)) {
+        return; // there always is an outermost particle
     }
     // A pressure on a particle in the middle has no direction.
     const double spacing = def->cell / body->particles_per_direction;
-    if (!q->has_box && o.least < spacing * NODE_PLANE_TOLERANCE &&
-        (!q->max_side || o.most < spacing)) {
+    const double at_centre = spacing * NODE_PLANE_TOLERANCE;
+    for (int d = 0; d < def->dimension; d++) {
+        const bool across = def->dimension == 2 || d != q->axis;
+        sieve.min[d] = across ? q->centre[d] - 2 * at_centre : -INFINITY;
+        sieve.max[d] = across ? q->centre[d] + 2 * at_centre : INFINITY;
+    }
+    struct round middle = {.load = q, .dim = def->dimension, .outer = at_centre};
+    struct round around = {.load = q, .dim = def->dimension, .inner = spacing, .outer = INFINITY};
+    if (mpm_check_finds(r, def, body, &sieve, 0, is_in_ring, &middle) &&
+        (!q->max_side || !mpm_check_finds(r, def, body, NULL, 1, is_in_ring, &around)) &&
+        !r->exhausted) {
         FAULT(r, MPM_ERR_CONFLICT, TEXT("/loads/%s/select/center", q->name),
               "off the particles that are loaded", "a particle at the centre",
               "load '%s' presses on a particle at its centre, which has no direction", q->name);
@@ -636,6 +693,8 @@ static void check_rigid(struct report *r, const struct mpm_def *def,
     }
 }
 
+#define SIDE_LOOKS 15 // that the distance from one side of a rigid body takes as long as
+
 struct intrusion {
     const struct mpm_rigid_def *rigid;
     int dim;
@@ -659,8 +718,14 @@ static void check_rigid_place(struct report *r, const struct mpm_def *def, size_
     for (size_t b = 0; b < def->n_bodies; b++) {
         const struct mpm_body_def *body = &def->bodies[b];
         struct intrusion o = {.rigid = q, .dim = def->dimension};
-        if (boxes_meet(&q->shape, &body->shape, def->dimension)) {
-            mpm_seed(def, body, look_in_rigid, &o);
+        struct mpm_sieve near = {.has_box = true};
+        if (boxes_meet(&q->shape, &body->shape, def->dimension) &&
+            mpm_shape_bounds(&q->shape, def->dimension, near.min, near.max)) {
+            const double sides = SIDE_LOOKS * (1 + (double)q->shape.n_points);
+            if (!mpm_check_affords(r, (1 + sides) * mpm_seed_looks(def, body, &near))) {
+                return;
+            }
+            mpm_seed_sifted(def, body, &near, look_in_rigid, &o);
         }
         if (o.inside) {
             FAULT(r, MPM_ERR_CONFLICT, TEXT("/rigid_bodies/%s/shape", q->name),
@@ -772,7 +837,7 @@ size_t mpm_check(const struct mpm_def *def,
     }
     double total = 0;
     bool made_of = true;
-    for (size_t b = 0; b < def->n_bodies && total < INFINITY; b++) {
+    for (size_t b = 0; b < def->n_bodies && total < INFINITY && !r.exhausted; b++) {
         made_of &= check_body(&r, def, b, &total);
     }
     if (made_of) {
@@ -784,7 +849,7 @@ size_t mpm_check(const struct mpm_def *def,
     for (size_t k = 0; k < def->n_probes && r.count == 0; k++) {
         mpm_check_probe_particles(&r, def, &def->probes[k]);
     }
-    for (size_t k = 0; k < def->n_rigids && total < INFINITY; k++) {
+    for (size_t k = 0; k < def->n_rigids && total < INFINITY && !r.exhausted; k++) {
         check_rigid_place(&r, def, k);
     }
     if (r.count) {

@@ -3,12 +3,18 @@
 #include <stdarg.h>
 #include <stdio.h>
 
-#include "server/mpm/mpm.h"
+#include "server/mpm/seed.h"
+
+// Looks at one lattice point of one shape, and what takes as long (1 ns or less), that the check of
+// a definition may take: with it seconds, whatever is posted.
+#define MPM_MAX_LOOKS 2e10
 
 struct report {
     void (*call)(void *context, const struct mpm_error *fault);
     void *context;
     size_t count;
+    double looks;   // so far
+    bool exhausted; // MPM_MAX_LOOKS; said already
 };
 
 static inline void add(struct report *r, const struct mpm_error *fault) {
@@ -41,6 +47,13 @@ static inline bool is_finite(double x) {
     return x - x == 0;
 }
 
+// Whether there is work left for so many looks; says once that there is not.
+bool mpm_check_affords(struct report *r, double looks);
+// Whether a particle of the body passes the sieve (which may be NULL) and is taken (by NULL: any).
+// True as well when the work is exhausted, so that nothing else is said of it.
+bool mpm_check_finds(struct report *r, const struct mpm_def *def, const struct mpm_body_def *body,
+                     const struct mpm_sieve *sieve, double looks_each,
+                     bool (*takes)(void *context, const double *x), void *context);
 // check_probe.c. A solution's own numbers, of which `pointer` is the place.
 void mpm_check_solution(struct report *r, const struct mpm_solution *q, const char *pointer);
 void mpm_check_probe(struct report *r, const struct mpm_def *def, const struct mpm_probe_def *q);

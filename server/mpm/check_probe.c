@@ -88,49 +88,49 @@ static void check_against(struct report *r, const struct mpm_def *def,
     mpm_exact_free(&e);
 }
 
-struct compared {
-    const struct mpm_def *def;
-    const struct mpm_probe_def *probe;
-    struct mpm_table table;
-    size_t count;
-};
+#define TABLE_LOOKS 200 // that reading a table takes as long as
 
-static bool look_at_compared(void *context, const double *x, double volume) {
-    (void)volume;
-    struct compared *o = context;
-    const struct mpm_probe_def *q = o->probe;
+static bool is_in_table(void *context, const double *x) {
     double value[MPM_MAX_COMPONENTS];
-    bool in = true;
-    for (int d = 0; d < o->def->dimension; d++) {
-        in &= !q->has_box || (x[d] >= q->box_min[d] && x[d] <= q->box_max[d]);
-        in &= !(q->has_select && q->select.has_box) ||
-              (x[d] >= q->select.box_min[d] && x[d] <= q->select.box_max[d]);
+    return mpm_table_at(context, x, value);
+}
+
+// The particles that the probe chooses from, but for those of a table.
+static struct mpm_sieve sieve_of(const struct mpm_def *def, const struct mpm_probe_def *q) {
+    struct mpm_sieve sieve = {.shape = q->has_exclude ? &q->exclude : NULL,
+                              .margin = MPM_COMPARE_EDGE * def->cell};
+    const bool selects = q->has_select && q->select.has_box;
+    sieve.has_box = q->has_box || selects;
+    for (int d = 0; d < def->dimension; d++) {
+        sieve.min[d] = fmax(q->has_box ? q->box_min[d] : -INFINITY,
+                            selects ? q->select.box_min[d] : -INFINITY);
+        sieve.max[d] =
+            fmin(q->has_box ? q->box_max[d] : INFINITY, selects ? q->select.box_max[d] : INFINITY);
     }
-    in = in && !(q->has_exclude &&
-                 mpm_shape_contains(&q->exclude, x, o->def->dimension, 1e-9 * o->def->cell));
-    in = in && (!o->table.of || mpm_table_at(&o->table, x, value));
-    o->count += in;
-    return !in; // one is enough
+    return sieve;
 }
 
 // That the probe finds a particle to read where it chooses.
 void mpm_check_probe_particles(struct report *r, const struct mpm_def *def,
                                const struct mpm_probe_def *q) {
-    struct compared o = {.def = def, .probe = q};
+    const struct mpm_sieve sieve = sieve_of(def, q);
+    const bool reads = q->kind == MPM_PROBE_ERROR && q->against.is_table;
+    struct mpm_table table = {0};
+    bool found = false;
     if (q->kind != MPM_PROBE_ERROR && !q->has_select) {
         return;
     }
-    if (q->kind == MPM_PROBE_ERROR && q->against.is_table &&
-        !mpm_table_create(&o.table, &q->against, mpm_compare_width(q, def->dimension))) {
+    if (reads && !mpm_table_create(&table, &q->against, mpm_compare_width(q, def->dimension))) {
         return; // memory: said when the simulation is made
     }
-    for (size_t b = 0; b < def->n_bodies && o.count == 0; b++) {
+    for (size_t b = 0; b < def->n_bodies && !found; b++) {
         if (q->body < 0 || q->body == (int)b) {
-            mpm_seed(def, &def->bodies[b], look_at_compared, &o);
+            found = mpm_check_finds(r, def, &def->bodies[b], &sieve, reads ? TABLE_LOOKS : 0,
+                                    reads ? is_in_table : NULL, &table);
         }
     }
-    mpm_table_free(&o.table);
-    if (o.count == 0) {
+    mpm_table_free(&table);
+    if (!found) {
         FAULT(r, MPM_ERR_EMPTY, TEXT("/probes/%s%s", q->name, q->has_select ? "/select" : ""),
               "at least one particle", "0", "probe '%s' reads no particle", q->name);
     }

@@ -9,8 +9,6 @@
 #include "server/mpm/sim.h"
 #include "server/mpm/table.h"
 
-#define EDGE 1e-9 // cells: how far inside an excluded shape a particle must be
-
 size_t mpm_compare_width(const struct mpm_probe_def *q, int dim) {
     return q->component >= 0 ? 1 : mpm_field_components((enum mpm_field)q->field, dim);
 }
@@ -72,6 +70,13 @@ static bool choose(struct mpm_compare *c, const struct mpm_sim *sim,
         }
         mpm_load_free(&picked);
     }
+    struct mpm_region *region =
+        q->has_exclude
+            ? mpm_region_create(&q->exclude, sim->grid.dim, MPM_COMPARE_EDGE * sim->def->cell)
+            : NULL;
+    if (q->has_exclude && !region) {
+        return false;
+    }
     FOR_PARTICLES(sim, q, s, p) {
         double x[MPM_MAX_DIM] = {0};
         bool in = !q->has_select || c->chosen[mpm_particle_id(s, p)];
@@ -79,10 +84,9 @@ static bool choose(struct mpm_compare *c, const struct mpm_sim *sim,
             x[d] = s->x[mpm_at(p, s->dim, d)];
             in &= !q->has_box || (x[d] >= q->box_min[d] && x[d] <= q->box_max[d]);
         }
-        in = in &&
-             !(q->has_exclude && mpm_shape_contains(&q->exclude, x, s->dim, EDGE * sim->def->cell));
-        c->chosen[mpm_particle_id(s, p)] = in;
+        c->chosen[mpm_particle_id(s, p)] = in && !(region && mpm_region_contains(region, x));
     }
+    mpm_region_free(region);
     return true;
 }
 

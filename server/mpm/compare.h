@@ -2,6 +2,8 @@
 #pragma once
 #include "server/mpm/solution.h"
 
+#define MPM_COMPARE_EDGE 1e-9 // cells: how far inside an excluded shape a particle must be
+
 struct mpm_sim;
 
 // One of each probe of a simulation.

@@ -12,6 +12,7 @@
     X(ERR_REFERENCE, "reference", "a name that nothing carries")                                   \
     X(ERR_CONFLICT, "conflict", "two settings that exclude each other")                            \
     X(ERR_EMPTY, "empty", "nothing where something is needed")                                     \
+    X(ERR_WORK, "work", "more than is checked of one definition")                                  \
     X(ERR_UNSTABLE_DT, "unstable_dt", "a time increment above the stability limit")                \
     X(ERR_NOT_FINITE, "not_finite", "a value that is not finite")                                  \
     X(ERR_VOLUME, "volume", "a volume ratio in use that is not positive")                          \

@@ -1,6 +1,6 @@
 // Filling shapes with particles on a lattice in the cells.
 #pragma once
-#include "server/mpm/mpm.h"
+#include "server/mpm/shape.h"
 
 struct mpm_particles;
 
@@ -11,15 +11,22 @@ double mpm_seed_bound(const struct mpm_def *def, const struct mpm_body_def *body
 // returns false.
 size_t mpm_seed(const struct mpm_def *def, const struct mpm_body_def *body,
                 bool (*each)(void *context, const double *x, double volume), void *context);
-// Whether a point lies strictly inside the shape, off its edge by more than `margin` (m).
-bool mpm_shape_contains(const struct mpm_shape *shape, const double *x, int dim, double margin);
-// The same for many points of one shape, which must outlive it: NULL without memory.
-struct mpm_region;
-struct mpm_region *mpm_region_create(const struct mpm_shape *shape, int dim, double margin);
-bool mpm_region_contains(const struct mpm_region *region, const double *x);
-void mpm_region_free(struct mpm_region *region); // NULL is fine
-// Bounding box, m. False for an empty shape.
-bool mpm_shape_bounds(const struct mpm_shape *shape, int dim, double *min, double *max);
+// Which of them: those in a box, and those strictly inside a shape (off its edge by more than
+// `margin`, m), or, with `inside` false, the others.
+struct mpm_sieve {
+    bool has_box;
+    double min[MPM_MAX_DIM], max[MPM_MAX_DIM]; // m, both taken in
+    const struct mpm_shape *shape;             // or NULL
+    double margin;
+    bool inside;
+};
+// mpm_seed for those that the sieve lets through; the work is that of the box and the shape.
+size_t mpm_seed_sifted(const struct mpm_def *def, const struct mpm_body_def *body,
+                       const struct mpm_sieve *sieve,
+                       bool (*each)(void *context, const double *x, double volume), void *context);
+// About how long that takes, in looks (mpm_shape_looks); the sieve may be NULL.
+double mpm_seed_looks(const struct mpm_def *def, const struct mpm_body_def *body,
+                      const struct mpm_sieve *sieve);
 // The velocity field of a body at reference position x, m/s.
 void mpm_velocity_at(const struct mpm_velocity *field, const double *x, int dim, double *v);
 // Half the particle size in cells that uGIMP uses for the body: 1 / (2 n).

@@ -566,16 +566,45 @@ void mpm_free(struct mpm_sim *sim) {
     free(sim);
 }
 
+#define STRIDE 3 // cells; see count_blocks
+
 struct counting {
     const struct mpm_def *def;
     struct mpm_grid grid; // of which only the slots are used
     bool out_of_memory;
+    bool begun, pending;      // whether there are:
+    double counted;           // place along the row of the last particle that was counted
+    double last[MPM_MAX_DIM]; // the last particle
 };
 
+static void count_around(struct counting *c, const double *x) {
+    c->out_of_memory |= !mpm_activate_around(&c->grid, c->def->basis, x);
+    c->counted = x[c->def->dimension - 1];
+    c->pending = false;
+}
+
+// Blocks are 4 cells wide and each particle needs two nodes a direction or more: in a row without
+// gaps of more than a cell, one particle every STRIDE cells and the last one need the same blocks
+// as all of them.
 static bool count_blocks(void *context, const double *x, double volume) {
     struct counting *c = context;
+    const int along = c->def->dimension - 1;
     (void)volume;
-    c->out_of_memory |= !mpm_activate_around(&c->grid, c->def->basis, x);
+    bool on = c->begun;
+    for (int d = 0; d < along; d++) {
+        on = on && x[d] == c->last[d];
+    }
+    on = on && x[along] > c->last[along] && x[along] - c->last[along] < c->def->cell * (1 + 1e-6);
+    if (!on && c->pending) {
+        count_around(c, c->last);
+    }
+    memcpy(c->last, x, (size_t)c->def->dimension * sizeof *x);
+    if (!on || x[along] - c->counted >= STRIDE * c->def->cell) {
+        count_around(c, x);
+    } else {
+        c->pending = true;
+    }
+    c->begun = true;
     return !c->out_of_memory;
 }
 
@@ -592,6 +621,10 @@ void mpm_estimate(const struct mpm_def *def, struct mpm_estimate *out) {
     for (size_t b = 0; b < def->n_bodies; b++) {
         const struct mpm_material_def *m = &def->materials[def->bodies[b].material];
         const size_t n = mpm_seed(def, &def->bodies[b], count_blocks, &c);
+        if (c.pending) {
+            count_around(&c, c.last);
+        }
+        c.begun = false;
         out->particles += n;
         largest = n > largest ? n : largest;
         out->bytes +=

@@ -1,10 +1,12 @@
 """Built-in scenes, materials, the scene's JSON Schema, validation and its cost estimate."""
 import json
+import math
+import resource
 
 import jsonschema
 import pytest
 from boxes import WATER_PARTICLES, endless, merged, water
-from fbard import ROOT, Daemon
+from fbard import ROOT, Daemon, is_sanitized
 
 FILES = {p.stem: p for p in (ROOT / "scenes").glob("*.json")}
 FILES |= {f"hard-{p.stem}": p for p in (ROOT / "scenes" / "hard").glob("*.json")}
@@ -161,6 +163,51 @@ def test_a_scene_beyond_the_memory_limit_is_422_before_anything_is_allocated(tmp
         assert d.get("/v1/runs")["runs"] == []
     finally:
         d.stop()
+
+
+def stars(count, corners):
+    """Polygons in polygons, each with many corners."""
+    def star(k):
+        def radius(i):
+            return 0.4 * (1 - 0.004 * k) * (1 + 0.05 * math.sin(14 * math.pi * i / corners + 0.1 * k) + 0.02 * (i % 2))
+        return [[round(0.5 + radius(i) * math.cos(2 * math.pi * i / corners), 6),
+                 round(0.5 + radius(i) * math.sin(2 * math.pi * i / corners), 6)] for i in range(corners)]  # fmt: skip
+    return [{"polygon": {"points": star(k)}} for k in range(count)]
+
+
+def fine(shape):
+    """Over 8 million lattice points where the shape fills the domain."""
+    return merged(endless(), {"domain": {"min": [0, 0], "max": [1, 1]}, "cell": 1 / 180, "walls": None, "time": {"dt": None},
+                              "bodies": {"bar": {"shape": shape, "particles_per_cell": 256, "velocity": None}}})  # fmt: skip
+
+
+def seconds_of_children():
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
+@pytest.mark.skipif(is_sanitized(), reason="counts the processor's time")
+def test_many_polygons_of_many_corners_take_the_time_of_points_and_corners(tmp_path):
+    d = Daemon(tmp_path, "--memory-limit", "8G").start()
+    before = seconds_of_children()
+    reply = validate(d, fine({"box": None, "intersection": stars(100, 900)}))
+    assert 1e6 < reply.json["estimate"]["particles"] < 4e6
+    d.stop()
+    # 1 s of the processor; 86 s when each point was held against the edges of its band in each polygon.
+    assert seconds_of_children() - before < 20
+
+
+@pytest.mark.skipif(is_sanitized(), reason="counts the processor's time")
+def test_a_scene_that_would_take_too_long_to_check_is_422_at_once(tmp_path):
+    d = Daemon(tmp_path, "--memory-limit", "8G").start()
+    before = seconds_of_children()
+    boxes = [{"box": {"min": [0, 0], "max": [1, 1 - k / 10000]}} for k in range(1000)]
+    for path, scene in (("/v1/scenes:validate", fine({"box": None, "union": boxes})),
+                        ("/v1/runs", {"scene": fine({"box": None, "union": boxes})})):  # fmt: skip
+        fault = d.ask("POST", path, scene, status=422).fault("" if "scene" not in scene else "/scene")
+        assert fault["code"] == "work" and "2e+10" in fault["expected"], fault
+    d.stop()
+    assert seconds_of_children() - before < 5  # where nothing is filled it is 0.1 s
 
 
 def test_faults_of_keys_and_of_the_solver_come_at_once(daemon):

@@ -782,6 +782,33 @@ def test_run_that_waits_for_memory_says_so(fresh):
     assert not d.wait("large", "running")["warnings"]
 
 
+def test_no_place_and_a_taken_id_are_told_before_shapes_are_filled(fresh):
+    d = fresh("--queue", "1", slots=1).start()
+    # Of its form, but its dt is one that only the solver finds fault with, as it does once it has filled the shapes.
+    refused = {"scene": water(time={"dt": 0.1})}
+    assert d.ask("POST", "/v1/runs", refused, status=422).json["errors"][0]["code"] == "unstable_dt"
+    d.create(TINY, id="there", start=False)
+    d.ask("POST", "/v1/runs", {**refused, "id": "there"}, status=409)
+    d.create(TINY, start=False)
+    d.ask("POST", "/v1/runs", refused, status=503)
+    d.ask("POST", "/v1/runs", {"scene": {**refused["scene"], "cell": -1}}, status=422)
+
+
+def test_repeated_request_is_answered_as_it_was_where_its_scene_no_longer_fits(fresh):
+    d = fresh().start()
+    body, key = {"scene": TINY, "id": "once"}, {"Idempotency-Key": "k"}
+    d.ask("POST", "/v1/runs", body, key, status=201)
+    d.wait("once", "completed")
+    d.stop()
+    d.options = ("--memory-limit", "1000")
+    d.start()
+    again = d.ask("POST", "/v1/runs", body, key, status=201)
+    assert again.headers["idempotency-replayed"] == "true" and again.json["id"] == "once"
+    other = d.ask("POST", "/v1/runs", {**body, "start": False}, key, status=422)
+    assert other.fault("")["code"] == "idempotency_key"
+    assert d.ask("POST", "/v1/runs", {"scene": TINY}, status=422).json["errors"][0]["code"] == "memory"
+
+
 def test_run_that_no_longer_fits_says_why_it_is_queued(fresh):
     d = fresh().start()
     d.create(TINY, id="large", start=False)

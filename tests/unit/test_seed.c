@@ -519,7 +519,8 @@ static bool look_again(void *context, const double *x, double volume) {
 }
 
 // Edges are sorted into bands of height, so that a point looks at few of them: the points are those
-// that looking at every edge finds. Stars with corners on lattice points, between them, and far out.
+// that looking at every edge finds. Stars with corners on lattice points, between them, and far
+// out.
 static void test_seed_of_many_corners_is_what_each_edge_says(void **state) {
     (void)state;
     const double h = 0.25, spacing = h / 4;
@@ -559,6 +560,139 @@ static void test_seed_of_many_corners_is_what_each_edge_says(void **state) {
     }
 }
 
+// ---- Rows: the same sides as point by point -----------------------------------------------------
+
+#define PARTS 5
+static double corners[PARTS][2 * 64];
+
+static double random_between(double low, double high) {
+    return low + (high - low) * rand() / RAND_MAX;
+}
+
+// A place near or on the lattice's: half-spacing multiples, round-off and small amounts beside
+// them.
+static double random_place(double unit) {
+    static const double beside[] = {0, 0, 0, 1e-9, 0.9e-7, 1.1e-7, 1e-4, 3.2e-4, 2e-3};
+    const double u = random_between(-4, 44);
+    const double off = beside[rand() % 9] * (rand() % 2 ? 1 : -1);
+    return unit * (rand() % 3 ? rint(u) + off : u);
+}
+
+static struct mpm_shape random_shape(int k, int dim, double unit) {
+    struct mpm_shape shape = {.kind = (enum mpm_shape_kind)(rand() % 5),
+                              .points = corners[k],
+                              .n_points = 3 + (size_t)(rand() % 60),
+                              .radius = unit * random_between(2, 30)};
+    if (dim == 2 && shape.kind > MPM_SHAPE_POLYGON) {
+        shape.kind = MPM_SHAPE_POLYGON;
+    } else if (dim == 3 && shape.kind == MPM_SHAPE_POLYGON) {
+        shape.kind = MPM_SHAPE_EXTRUDE;
+    }
+    for (int d = 0; d < 3; d++) {
+        shape.min[d] = random_place(unit);
+        shape.max[d] = shape.min[d] + unit * (1 + rand() % 40);
+        shape.centre[d] = random_place(unit);
+    }
+    if (rand() % 2) { // a circle through lattice points: 3-4-5 triangles
+        shape.radius = 10 * unit;
+    }
+    for (size_t i = 0; i < 2 * shape.n_points; i++) { // any closed line has an inside, by parity
+        corners[k][i] = random_place(unit);
+    }
+    return shape;
+}
+
+// Every side of every row, with and without what makes rows quick, for shapes alone and combined.
+static void test_rows_are_what_each_point_says(void **state) {
+    (void)state;
+    static struct mpm_rows rows, singly;
+    size_t on_edge = 0, inside = 0;
+    srand(11);
+    for (int round = 0; round < 400; round++) {
+        const int dim = 2 + round % 2;
+        const double unit = 0.125;
+        struct mpm_lattice l = {.dim = dim, .unit = unit};
+        if (round % 4 > 1) { // as a body sees the particles of another
+            l.spacing = round % 8 > 3 ? 2 * unit : 0.3;
+            for (int d = 0; d < dim; d++) {
+                l.first[d] = round % 16 > 7 ? 0 : 0.123;
+            }
+        }
+        struct mpm_shape parts[PARTS];
+        for (int k = 0; k < PARTS; k++) {
+            parts[k] = random_shape(k, dim, unit);
+        }
+        const struct mpm_shape sets[] = {
+            {.kind = MPM_SHAPE_UNION, .children = parts, .n_children = 2},
+            {.kind = MPM_SHAPE_DIFFERENCE, .children = parts + 2, .n_children = 2}};
+        const struct mpm_shape all = {.kind = (enum mpm_shape_kind)(MPM_SHAPE_UNION + round % 3),
+                                      .children = sets,
+                                      .n_children = 2};
+        const struct mpm_shape *shape = round % 5 == 0 ? &all : &parts[round % 5];
+        mpm_rows_create(&rows, shape, &l);
+        mpm_rows_create(&singly, shape, &l);
+        mpm_rows_free(&singly);
+        for (long long i = -3; i < 24; i++) {
+            for (long long j = -3; j < (dim == 3 ? 24 : -2); j++) {
+                const long long index[] = {i, dim == 3 ? j : -3, -3};
+                const signed char *quick = mpm_rows_at(&rows, index, 27);
+                const signed char *slow = mpm_rows_at(&singly, index, 27);
+                for (int k = 0; k < 27; k++) {
+                    if (quick[k] != slow[k]) {
+                        print_error("round %d: side %d at %lld %lld %d, %d point by point\n", round,
+                                    quick[k], i, index[1], k - 3, slow[k]);
+                        fail();
+                    }
+                    on_edge += slow[k] == 0;
+                    inside += slow[k] > 0;
+                }
+            }
+        }
+        mpm_rows_free(&rows);
+    }
+    assert_true(on_edge > 1000 && inside > 100000);
+}
+
+struct sifted {
+    const struct mpm_sieve *sieve;
+    size_t count;
+};
+
+static bool look_sifted(void *context, const double *x, double volume) {
+    struct sifted *o = context;
+    const struct mpm_sieve *s = o->sieve;
+    (void)volume;
+    bool in = mpm_shape_contains(s->shape, x, 2, s->margin) == s->inside;
+    for (int d = 0; d < 2; d++) {
+        in = in && x[d] >= s->min[d] && x[d] <= s->max[d];
+    }
+    o->count += in;
+    return true;
+}
+
+static void test_seed_sifted_is_what_each_particle_says(void **state) {
+    (void)state;
+    const struct mpm_def def = domain(2, 0.25, zero);
+    srand(5);
+    for (int round = 0; round < 100; round++) {
+        const struct mpm_shape shape = random_shape(0, 2, 0.03125),
+                               other = random_shape(1, 2, 0.03125);
+        const struct mpm_body_def body = {
+            .shape = shape, .particles_per_direction = 4, .closed = round % 2};
+        struct mpm_sieve sieve = {.has_box = true,
+                                  .min = {random_place(0.03125), random_place(0.03125)},
+                                  .shape = &other,
+                                  .margin = 0.03125,
+                                  .inside = round % 4 < 2};
+        for (int d = 0; d < 2; d++) {
+            sieve.max[d] = sieve.min[d] + random_between(0, 1.2);
+        }
+        struct sifted o = {.sieve = &sieve};
+        mpm_seed(&def, &body, look_sifted, &o);
+        assert_int_equal(mpm_seed_sifted(&def, &body, &sieve, NULL, NULL), o.count);
+    }
+}
+
 int main(int argc, char **argv) {
     feenableexcept(FE_DIVBYZERO | FE_INVALID | FE_OVERFLOW);
     const struct CMUnitTest tests[] = {
@@ -583,6 +717,8 @@ int main(int argc, char **argv) {
         cmocka_unit_test(test_seed_polygon_contains_and_bounds),
         cmocka_unit_test(test_seed_cylinder_has_its_volume),
         cmocka_unit_test(test_seed_of_many_corners_is_what_each_edge_says),
+        cmocka_unit_test(test_rows_are_what_each_point_says),
+        cmocka_unit_test(test_seed_sifted_is_what_each_particle_says),
     };
     cmocka_set_test_filter(argc > 1 ? argv[1] : NULL);
     return cmocka_run_group_tests(tests, NULL, NULL);
