@@ -346,26 +346,28 @@ demo: deps ## the paper's dam break, F-bar on and off: pictures in build/demo (u
 	@$(MAKE) --no-print-directory all
 	@scenes/demo.sh
 
-# SIZE=small takes minutes, SIZE=paper hours; both go on where they were stopped or killed (bench/report/README.md).
+# JOBS runs at a time. SIZE=small takes minutes, SIZE=paper hours; both go on where they were stopped or killed (bench/report/README.md).
 SIZE ?= small
+JOBS ?= $(shell nproc)
 report: deps-report ## the paper's figures with our numbers: build/report/SIZE/report.html (SIZE=small, minutes; SIZE=paper, hours)
 	@$(MAKE) --no-print-directory all $(B)/runner
 	@$(MAKE) --no-print-directory studies
-	@$(PYTHON) bench/report $(SIZE) $(REPORT)
+	@$(PYTHON) bench/report $(SIZE) --jobs $(JOBS) $(REPORT)
 
-# Many small runs; each keeps what it has done in build/report/SIZE/points.jsonl and goes on there.
-STUDY = RUNNER=$(CURDIR)/$(B)/runner $(PYTHON)
-QUICK = $(if $(filter paper,$(SIZE)),,--quick)
+# Many small runs; what is done is kept in build/report/SIZE/points.jsonl, and they go on there.
+STUDY = JOBS=$(JOBS) RUNNER=$(CURDIR)/$(B)/runner $(PYTHON)
 studies: $(B)/runner
 	@mkdir -p build/report/$(SIZE)
-	@for study in "accuracy.py $(SIZE)" "creep.py $(QUICK)" "schemes.py" "hard.py" "ladder.py $(QUICK)"; do echo "bench/$$study"; \
+	@for study in "accuracy.py $(SIZE)" creep.py schemes.py tearing.py hard.py ladder.py; do echo "bench/$$study"; \
 	  $(STUDY) bench/$$study -o build/report/$(SIZE) > build/report/$(SIZE)/study.txt || echo "bench/$$study: exit code $$?, see build/report/$(SIZE)/study.txt"; done
 
 report-page: deps-report ## the same page of what was run so far; runs nothing
 	@$(PYTHON) bench/report $(SIZE) --page
 
-report-docs: deps-report # docs/report.md and its pictures, of what was run so far
+# Of the small size also the numbers that other docs have from it, which `make check` compares.
+report-docs: deps-report ## docs/report-SIZE.md with its pictures and data, and numbers in docs, of what was run so far
 	@$(PYTHON) bench/report $(SIZE) --page --docs
+	@$(if $(filter small,$(SIZE)),$(PYTHON) bench/advice.py)
 
 # What is generated for an installation: manual pages and completions from the tables of the programs, the solver's
 # header as one file, and what names PREFIX.

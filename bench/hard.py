@@ -17,6 +17,7 @@ import dataclasses
 import itertools
 import math
 import pathlib
+import re
 import sys
 
 import study
@@ -51,7 +52,10 @@ class Case:
     samples: int = 20
     seconds: float = 120
     quick: tuple = ()  # labels of `vary` that the quick table has; none: not in it
-    why: str = ""  # what is behind the verdicts that are no pass
+    # What is behind the verdicts that are no pass. {variant|bases|schemes|measure} is the range of a measure over those
+    # (* is all bases but linear), {...|factor|format} with another unit or precision, {tearing|bases|scheme|n} the
+    # stretch at which a strip parts (tearing.py): numbers are those of the run that is told of.
+    why: str = ""
 
 
 def energy_gain(result):
@@ -122,51 +126,70 @@ CASES = [
         Measure("pressure RMS", lambda r: last(r, "pressure_error"), 0, 0.6, "of the FEM pressure's spread; h = 4 m")],
         {f"nu = {nu}": {"materials": {"rubber": {"poisson_ratio": nu}}} for nu in (0.499, 0.4999, 0.49999)},
         quick=("nu = 0.499",),
-        why="Without F̄ the pressure is noise that grows with K, and uGIMP is too stiff as well; zhao creeps, with "
-        "cubic splines at nu = 0.499 past the tolerance. keep = 0.1 is for nu = 0.499; beyond, take about sqrt(5 "
-        "mu/K)."),
+        why="Without F̄ the pressure is noise that grows with K (quadratic: {nu = 0.499|bspline2|standard|pressure RMS} of "
+        "the pressure's spread at nu = 0.499, {nu = 0.49999|bspline2|standard|pressure RMS} at 0.49999), and linear and "
+        "uGIMP are too stiff as well (uGIMP at nu = 0.49999: {nu = 0.49999|gimp|standard|column} m, not 0.262). zhao "
+        "creeps, with cubic splines at nu = 0.499 past the tolerance. keep = 0.1 is for nu = 0.499: beyond, it brings the "
+        "noise back, linear and uGIMP from 0.4999, all at 0.49999; take about sqrt(5 mu/K)."),
     Case("disk, 10 turns", "hard-rotating-disk", [
         Measure("angular momentum", spin_left, 1, 0.1, "exact"),
         Measure("energy gained", energy_gain, 0, 1e-3, "nothing brings any in")],
-        why="FLIP on a grid loses spin, whatever the scheme: the disk's radius is 4 cells. Linear: cell crossings "
-        "turn particles inside out."),
+        why="FLIP on a grid loses spin, whatever the scheme: {|*|*|angular momentum} of it is left, and the disk's radius is "
+        "4 cells. Linear: cell crossings turn particles inside out."),
     Case("disk collision", "disk-collision", [
         Measure("momentum", momentum_off, 0, 1e-10, "exact; round-off of some thousand steps"),
         Measure("energy left", total_left, 0.85, 0.25, "elastic; standard quadratic B-splines keep 0.76"), NO_GAIN],
-        why="zhao takes a third to a half of the energy, and with B-splines gives a little at the rebound (it has no "
-        "energy proof). Linear: cell crossings."),
+        why="zhao leaves {|*|zhao|energy left} of the energy where anchored leaves {|*|anchored|energy left}, and with "
+        "B-splines makes some on the way ({|bspline2 bspline3|zhao|energy gained} of the kinetic energy): it has no "
+        "energy proof. Linear: cell crossings turn particles inside out."),
     Case("bar impact", "hard-bar-impact", [
         Measure("length", lambda r: last(r, "length"), 0.2483, 0.15, "h = 0.05 m, quadratic B-splines, anchored"),
         NO_GAIN, DRIFT], {"10 m/s": {}}, quick=("10 m/s",),
-        why="Without F̄ the bar locks, with keep = 0.1 a little (uGIMP, cubic). zhao has the length right, but the "
-        "volumes of forces and stresses part. Linear: cell crossings."),
+        why="Without F̄ the bar locks: it ends {10 m/s|*|standard|length} m long, not 0.248; with keep = 0.1 a little, with "
+        "uGIMP and cubic splines past the tolerance ({10 m/s|gimp|keep|length} and {10 m/s|bspline3|keep|length} m). zhao "
+        "has the length right, but the volumes of forces and stresses part, by {10 m/s|*|zhao|drift} in the logarithm. "
+        "Linear: cell crossings turn particles inside out."),
     Case("bar impact", "hard-bar-impact-fast", [
         Measure("length at 0.025 s", lambda r: at(r, "length", 0.025), 0.2373, 0.15,
                 "h = 0.05 m, quadratic B-splines, anchored"), NO_GAIN, DRIFT],
         {"40 m/s": {}},
-        why="As at 10 m/s; B-splines without F̄ are within the tolerance, since inertia rules."),
+        why="uGIMP without F̄ locks ({40 m/s|gimp|standard|length at 0.025 s} m, not 0.237); B-splines without F̄ are within "
+        "the tolerance, since inertia rules. zhao: the volumes of forces and stresses part, by {40 m/s|*|zhao|drift}. "
+        "Linear: cell crossings."),
     Case("stretch to 4 x", "hard-stretch", [
         Measure("stretch of the middle", lambda r: 1 + last(r, "middle.x") / 1.5, 4, 0.05, "exact"), DRIFT],
         {f"{n} per cell": {"bodies": {"strip": {"particles_per_cell": n}}} for n in (9, 49)},
         seconds=60,
-        why="With 9 particles per cell they end 1.3 cells apart: the body parts numerically, with every scheme. With "
-        "49 it does not, but F̄ by anchored (and by zhao with uGIMP) lets particles gather within cells, which "
-        "nothing but the shear modulus resists, until it tears; with keep that comes later, with cubic splines "
-        "never."),
+        why="Particles end s/n of a cell apart, s the stretch and n their number in each direction of a cell. Without F̄ a "
+        "B-spline strip parts when that passes one cell, so that there are cells without a particle, whose stiffness "
+        "nobody carries (quadratic: at {tearing|bspline2|standard|2}, {tearing|bspline2|standard|3} and "
+        "{tearing|bspline2|standard|4} for n = 2, 3, 4; 9 per cell is n = 3, too few for 4 whatever the scheme), long "
+        "before the supports of neighbours part (3 and 4 cells). uGIMP parts at {tearing|gimp|standard|4} and "
+        "{tearing|gimp|standard|5} for n = 4 and 5: its particles keep the size they began with, so that gaps open "
+        "between them at once, and its gradients are nearly steps, so that a cell's force hangs on how many particles "
+        "are in it (cpGIMP and CPDI let particles grow; fbard has neither). With 49 per cell (n = 7) that is no matter, but F̄ lets "
+        "particles gather within cells, which nothing but the shear modulus resists, until the strip tears: anchored at "
+        "{tearing|gimp bspline2 bspline3|anchored|7}; zhao with uGIMP at {tearing|gimp|zhao|7}, and with B-splines it "
+        "holds with volumes far apart; keep later ({tearing|gimp bspline2|keep|7}), with cubic splines never."),
     Case("dead load on a column", "hard-dead-load", [
         Measure("displacement", lambda r: last(r, "middle.x"), 0.75, 0.05, "exact"), DRIFT], seconds=60,
-        why="A load on the outermost particles meets a stress that F̄ averages over a cell: the layer comes off "
-        "(method.md, section 4). Spread the load over a cell. With keep it holds within 0.4 %. zhao with "
-        "B-splines holds it, with volumes far apart."),
+        why="A load on the outermost particles meets a stress that F̄ averages over a cell: with anchored the layer comes off "
+        "(method.md, section 4), with zhao and uGIMP too. Spread the load over a cell. With keep = 0.1 it holds: "
+        "{|*|keep|displacement} m, exact 0.75. zhao with B-splines holds it, with volumes apart by {|bspline2 "
+        "bspline3|zhao|drift} in the logarithm. Linear: cell crossings turn particles inside out."),
     Case("residual strength 0.05 kPa", "hard-residual-strength", [
         Measure("run-out", lambda r: last(r, "runout"), 29.9, 0.1, "h = 0.25 m with the anchored F-bar: 29.98, 29.82"),
         NO_GAIN, DRIFT],
-        why="Without F̄ the slope locks (linear, uGIMP most), and a little with keep; zhao's volumes part; cubic "
-        "splines run out less at this h. Linear with F̄: cell crossings."),
+        why="Without F̄ the slope locks (linear and uGIMP stop at {|gimp|standard|run-out} m, B-splines at {|bspline2 "
+        "bspline3|standard|run-out}, not 29.9), with keep = 0.1 a little (uGIMP {|gimp|keep|run-out}, quadratic "
+        "{|bspline2|keep|run-out} m; anchored {|gimp|anchored|run-out} and {|bspline2|anchored|run-out}). zhao's volumes "
+        "part, by {|*|zhao|drift} in the logarithm. Cubic splines run out less at this h, with every scheme. Linear with "
+        "F̄: cell crossings."),
     Case("footing at a tenth of the rate", "hard-footing-slow", [
         Measure("load", lambda r: last(r, "load.y"), 5.14159, 0.15, "2 + pi; FEM at this h 5.29"), DRIFT],
-        why="Without F̄ too stiff, uGIMP with keep = 0.1 still: where the flow is plastic, little but K resists. zhao "
-        "with B-splines: the load creeps away in so many steps."),
+        why="Without F̄ too stiff ({|*|standard|load} where 5.14 is exact), linear and uGIMP with keep = 0.1 still ({|linear "
+        "gimp|keep|load}): where the flow is plastic, little but K resists. zhao with B-splines: the load creeps away in "
+        "so many steps ({|bspline2 bspline3|zhao|load})."),
     Case("dam break", "hard-dam-break", [
         Measure("front at 0.336 s", lambda r: at(r, "front", 0.336), 5.0, 0.05, "h = 0.25 m, 25 per cell, K = 2e9"),
         NO_GAIN],
@@ -175,25 +198,29 @@ CASES = [
                                               {"name": "flow", "remove": {"walls": ["gate"]}}]}
          for k in (2e6, 2e7, 2e8, 2e9) for cfl in (0.1, 0.3, 0.5)},
         bases=("gimp", "bspline2"), samples=16, quick=("K = 2e+06, CFL 0.5",),
-        why="Only without F̄: uGIMP is late from K = 2e7 on, quadratic splines at 2e9, and uGIMP with keep = 0.1 at "
-        "2e9."),
+        why="Without F̄ uGIMP is late from K = 2e7 on (front at {K = 2e+07, CFL 0.3|gimp|standard|front at 0.336 s} m, not "
+        "5.0; {K = 2e+09, CFL 0.3|gimp|standard|front at 0.336 s} at 2e9) and quadratic splines at 2e9 ({K = 2e+09, CFL "
+        "0.3|bspline2|standard|front at 0.336 s}); with keep = 0.1 uGIMP at 2e9 ({K = 2e+09, CFL 0.3|gimp|keep|front at "
+        "0.336 s}). Increments do not matter."),
     Case("dam break to 6 s", "hard-dam-break", [NO_GAIN],
          {"K = 2e7": {"time": {"end": 6}}}, samples=60,
-        why="Linear: cell crossings."),
+        why="Linear: cell crossings turn particles inside out before the gate goes."),
     Case("one particle per cell", "hard-one-per-cell", [
         Measure("weight", lambda r: last(r, "floor_force.y"), -19570.95, 0.01, "exact"),
         Measure("pressure", lambda r: last(r, "pressure_error"), 0, 0.1, "largest error over that at the foot")],
         {"1": {}}, quick=("1",),
-        why="zhao never comes to rest; its pressure is off by that much of the pressure at the foot."),
+        why="zhao never comes to rest (as the resting column, below); its pressure is off by {1|*|zhao|pressure} of that at "
+        "the foot."),
     Case("49 particles per cell", "hard-many-per-cell", [
         Measure("weight", lambda r: last(r, "floor_force.y"), -19570.95, 0.01, "exact"),
         Measure("pressure", lambda r: last(r, "pressure_error"), 0, 0.1, "largest error over that at the foot")],
-        why="As with one particle per cell."),
+        why="zhao never comes to rest, as with one particle per cell; its pressure is off by {|*|zhao|pressure}."),
     Case("on edges, walls, corners", "hard-on-edges", [
         Measure("weight", lambda r: last(r, "floor.y"), -9810, 0.01, "exact"),
         Measure("top", lambda r: last(r, "top"), 1, 0.03, "exact: 3 mm below 1 m; 3 % is a tenth of a cell")],
         {"": {}}, quick=("",),
-        why="Linear only: particles that barely reach a node."),
+        why="Linear only: particles that barely reach a node, where the weight of a neighbour is nearly 0. Without F̄ one "
+        "turns inside out, zhao and anchored carry {|linear|zhao|weight||.0f} and {|linear|anchored|weight||.0f} N of -9810."),
     Case("lone particle", "hard-lone-particle", [
         Measure("height at 0.5 s", flight_off("y"), 0, 0.0044, "free flight; a step's increment acts on its whole step: g t dt/2"),
         Measure("distance at 0.5 s", flight_off("x"), 0, 1e-9, "free flight, no force"),
@@ -206,19 +233,49 @@ CASES = [
                 "over the 5 mm that the column is compressed by"),
         Measure("kinetic energy", lambda r: last(r, "energy.kinetic"), 0, 1e-3 * 4.0, "of the strain energy, 4 J")],
         {"1e6 steps": {}, "2e4 steps": {"time": {"end": 44}}}, seconds=300, quick=("2e4 steps",),
-        why="F̄ has no stiffness against motions whose change of volume cancels within every cell (the particles "
-        "around every other node move together), and water resists nothing else: at the free surface, where few "
-        "particles carry a node, they are pushed. zhao collapses; anchored with B-splines sinks by 42 and 11 mm "
-        "in 2e4 steps and then farther; with a = 1 by less than 4 mm, with keep by less than 3 mm and at rest "
-        "(`schemes.csv`), without F̄ not at all."),
+        why="F̄ has no stiffness against motions whose change of volume cancels within every cell (the particles around every "
+        "other node move together), and water resists nothing else: at the free surface, where few particles carry a "
+        "node, they are pushed. zhao collapses. anchored with B-splines sinks, by {2e4 steps|bspline2|anchored|sinking of "
+        "the top|-5|.0f} and {2e4 steps|bspline3|anchored|sinking of the top|-5|.0f} mm in 2e4 steps, quadratic ones by "
+        "{1e6 steps|bspline2|anchored|sinking of the top|-5|.0f} mm in 1e6, where cubic ones leave the domain and linear "
+        "ones turn inside out; with uGIMP it rests. With keep = 0.1 all do (the top is within {1e6 "
+        "steps|bspline2|keep|sinking of the top|5|.1f} mm of where it belongs), and without F̄."),
     Case("free fall of 1,000 cells", "hard-free-fall", [
         Measure("speed", fall_off, 0, 1e-12, "exact; round-off of 9,000 steps"),
         Measure("stress", fall_stress, 0, 1e-11,
                 "exact 0; a position of 1,000 cells is known to 1e-13 of a cell, the speed is 400 cells/s"),
         Measure("drift", lambda r: number(r["series"][-1]["drift"]), 0, 1e-11, "exact 0, as the stress")],
         {"": {}}, quick=("",),
-        why="Linear without F̄: the stress is 1.05e-11 of Young's modulus, round-off."),
+        why="Linear without F̄: particles that barely reach a node; their round-off comes to the tolerance "
+        "({|linear|standard|stress} of Young's modulus; 1.05e-11 and 6.1e-12 on builds that differ in the order of "
+        "operations)."),
 ]  # fmt: skip
+
+
+def ranged(numbers, form=""):
+    """`low to high`, or one number."""
+    texts = list(dict.fromkeys(f"{x:{form or '.3g'}}" for x in (min(numbers), max(numbers))))
+    return " to ".join(texts)
+
+
+def told(case, rows, tearing):
+    """The case's `why` with numbers of hard-cases.csv (rows) and tearing.csv."""
+
+    def resolve(found):
+        variant, bases, schemes, measure, factor, form = (found[1].split("|") + ["", ""])[:6]
+        bases = BASES[1:] if bases == "*" else bases.split()
+        if variant == "tearing":
+            numbers = [float(r["parts at"]) for r in tearing if r["basis"] in bases and r["scheme"] == schemes and r["n"] == measure and r["parts at"]]
+            return ranged(numbers, ".1f") if numbers else "no stretch up to 4"
+        schemes = list(SCHEMES) if schemes == "*" else schemes.split()
+        numbers = [float(m.rsplit(" ", 1)[1]) * float(factor or 1) for r in rows
+                   if (r["case"], r["variant"]) == (case.name, variant) and r["basis"] in bases and r["scheme"] in schemes
+                   for m in r["measures"].split("; ") if m.rsplit(" ", 1)[0] == measure]  # fmt: skip
+        if not numbers:
+            raise KeyError(f"{case.name}: nothing is measured of {found[0]}")
+        return ranged(numbers, form)
+
+    return re.sub(r"\{([^{}]*)\}", resolve, case.why)
 
 
 def points(cases, quick):

@@ -3,7 +3,7 @@
 largest multiple of the stability limit that the daemon states at which a shaken block that moves through the grid
 stays whole for STEPS (1,500 in 2D, 600 in 3D) steps, and the smallest at which it does not.
 
-    bench/ladder.py [--quick] [-o FOLDER]
+    bench/ladder.py [-o FOLDER]
 
 The block's strain energy cannot pass the kinetic energy of its shake; a run blows up when it fails or has BLOWN
 times as much. What blows up at FIRST of the limit too does so for another reason than the increment. The linear basis
@@ -105,15 +105,12 @@ def climb(store, wanted, say):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--quick", action="store_true", help="2D, one case of each basis and kind of limit")
     parser.add_argument("-o", "--output", type=pathlib.Path, default=ROOT / "build" / "report" / "small")
     options = parser.parse_args()
-    materials = ["elastic, nu = 0.3", "viscous fluid"] if options.quick else list(MATERIALS)
-    wanted = list(cases([2] if options.quick else [2, 3], BASES, SCHEMES, materials))
-    if not options.quick:  # many particles: uGIMP bears the less the more there are
-        for n in (7, 10):
-            wanted += cases([2], BASES[1:], ["standard", "anchored"], ["elastic, nu = 0.3", "viscous fluid"], n)
-        wanted += cases([3], ["gimp"], ["standard"], ["elastic, nu = 0.3"], 5)
+    wanted = list(cases([2, 3], BASES, SCHEMES, MATERIALS))
+    for n in (7, 10):  # many particles: uGIMP bears the less the more there are
+        wanted += cases([2], BASES[1:], ["standard", "anchored"], ["elastic, nu = 0.3", "viscous fluid"], n)
+    wanted += cases([3], ["gimp"], ["standard"], ["elastic, nu = 0.3"], 5)
     store = Store(options.output / "points.jsonl")
     ask_limits(wanted)
     rows = climb(store, wanted, lambda text: print(text, file=sys.stderr))

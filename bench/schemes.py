@@ -1,6 +1,7 @@
 #!/usr/bin/env python3
 """`zhao` against `anchored`, and what the constants of `anchored` do: static and dynamic problems and hard cases, for
-a from 0.02 to 1, C from 0 to 2, keep up to 0.1, and a = clamp(25 mu/K, 0.02, 1).
+a from 0.02 to 1, C from 0 to 2, keep up to 0.1, and a = clamp(25 mu/K, 0.02, 1); and keep in long flows and in the
+balance of energy.
 
     bench/schemes.py [-o FOLDER]
 
@@ -17,6 +18,28 @@ FEM = 0.261735  # m, scenes/cook-membrane.json
 def energy_left(result):
     first, end = result["series"][0], result["series"][-1]
     return (number(end["kinetic"]) + number(end["strain"])) / (number(first["kinetic"]) + number(first["strain"]))
+
+
+def balance(result):
+    """Kinetic and strain energy less the work of gravity and body forces, of every sample of the last stage, over the
+    largest kinetic energy: exactly constant."""
+    rows = [row for row in result["series"] if row["time"] >= 0]
+    scale = max(number(row["kinetic"]) for row in rows)
+    return [(number(row["kinetic"]) + number(row["strain"]) - number(row["work"])) / scale for row in rows]
+
+
+def energy_lost(result):
+    b = balance(result)
+    return b[0] - b[-1]
+
+
+def energy_gained(result):
+    b = balance(result)
+    return max(b) - b[0]
+
+
+def drift(result):
+    return max(number(row["drift"]) for row in result["series"])
 
 
 def at_rest(result):
@@ -56,11 +79,28 @@ PROBLEMS = {
     "stretch to 4 x, 49 per cell": ("hard-stretch", {"bodies": {"strip": {"particles_per_cell": 49}}}, 0.002, {
         "stretch": lambda r: 1 + last(r, "middle.x") / 1.5}),
     "dam break, K = 2e7": ("hard-dam-break", {"time": {"end": 0.672}}, 0.0, {
-        "front at 0.336 s, m": lambda r: at(r, "front", 0.336), "largest pressure at the end, Pa": lambda r: last(r, "pressure_max")}),
+        "front at 0.336 s, m": lambda r: at(r, "front", 0.336), "largest pressure at the end, Pa": lambda r: last(r, "pressure_max"),
+        "drift": drift, "energy gained": energy_gained}),
     "disk collision": ("disk-collision", {}, 0.002, {"energy left": energy_left}),
     "bar impact": ("hard-bar-impact", {}, 0.002, {
         "length, m": lambda r: last(r, "length"), "largest pressure, Pa": lambda r: last(r, "pressure_max"),
-        "drift": lambda r: max(number(row["drift"]) for row in r["series"])}),
+        "drift": drift}),
+}  # fmt: skip
+
+# What keep costs in long flows and in the balance of energy; without the scan of a and C.
+KEPT = {
+    "landslide slice, h = 0.25 m": ("landslide-slice", {"cell": 0.25, "time": {"dt": None, "cfl": 0.3}, "probes": {
+        "pressure": {"kind": "minimum", "field": "mean_stress", "scale": -1, "average": 0.1}}}, ("gimp", "bspline2"), (0, 0.02, 0.1), {
+        "run-out at 2.5 s, m": lambda r: at(r, "runout", 2.5) - 15, "at 5.5 s, m": lambda r: last(r, "runout") - 15,
+        "largest pressure at 2.5 s, kPa": lambda r: at(r, "pressure", 2.5) / 1000, "drift": drift, "energy gained": energy_gained}),
+    "oscillating column": ("hydrostatic-column", {"damping": {"mass": 0}, "materials": {"water": {"viscosity": 0}}}, ("gimp", "bspline2", "bspline3"), (0, 0.02, 0.1), {
+        "energy lost": energy_lost, "energy gained": energy_gained, "drift": drift}),
+    "vortex, a whole swing": ("vortex-incompressible", {}, ("gimp", "bspline2", "bspline3"), (0, 0.02, 0.1), {
+        "energy lost": energy_lost, "energy gained": energy_gained, "drift": drift}),
+    "Cook at nu = 0.49999, h = 4 m": ("hard-incompressible", {"materials": {"rubber": {"poisson_ratio": 0.49999}}}, ("gimp", "bspline2", "bspline3"), (0, 0.01, 0.1), {
+        "pressure RMS": lambda r: last(r, "pressure_error")}),
+    "dead load at nu = 0.49999": ("hard-dead-load", {"materials": {"rubber": {"poisson_ratio": 0.49999}}}, ("gimp", "bspline2", "bspline3"), (0, 0.01, 0.1), {
+        "displacement, m": lambda r: last(r, "middle.x")}),
 }  # fmt: skip
 
 
@@ -78,6 +118,13 @@ def variants(ratio):
     yield f"formula: a = {a:g}, C = 1", {"scheme": "anchored", "a": a, "C": 1}
 
 
+def kept(keeps):
+    yield "standard", False
+    yield "zhao", {"scheme": "zhao", "a": None, "C": None}
+    for keep in keeps:
+        yield "a = 0.05, C = 1" + (f", keep = {keep}" if keep else ""), {"scheme": "anchored", "a": 0.05, "C": 1, "keep": keep}
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("-o", "--output", type=pathlib.Path, default=ROOT / "build" / "report" / "small")
@@ -86,6 +133,9 @@ def main():
                Point(scene, composed(patch, {"basis": basis, "fbar": fbar}), 12))
               for name, (scene, patch, ratio, measures) in PROBLEMS.items()
               for basis in ("gimp", "bspline2", "bspline3") for label, fbar in variants(ratio)]  # fmt: skip
+    wanted += [({"problem": name, "basis": basis, "scheme": label}, measures,
+                Point(scene, composed(patch, {"basis": basis, "fbar": fbar}), 110))
+               for name, (scene, patch, bases, keeps, measures) in KEPT.items() for basis in bases for label, fbar in kept(keeps)]  # fmt: skip
     results = Store(options.output / "points.jsonl").all([p for *_, p in wanted])
     rows = []
     for (labels, measures, _), result in zip(wanted, results):

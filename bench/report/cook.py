@@ -226,7 +226,7 @@ def figure_5(shelf):
     def draw(path):
         if not there:
             return
-        figure, (left, right) = curves((7.4, 3.4), 2)
+        figure, (left, right) = curves((8.2, 3.4), 2)
         for scheme in ("standard", "zhao", "anchored"):
             if scheme in there:
                 for axis in (left, right):
@@ -236,7 +236,7 @@ def figure_5(shelf):
             axis.set_xlabel("Y in the reference configuration (m)"), axis.set_ylabel("mean stress (Pa)")
         right.set_ylim(-0.16, 0.16)
         left.set_title("X = 24 m: all"), right.set_title("the same, nearer")
-        legend(left, loc="lower left")
+        legend(right, loc="center left", bbox_to_anchor=(1, 0.5))
         save(figure, path)
 
     if "zhao" not in there:
@@ -284,7 +284,7 @@ def figure_6(shelf):
                     axis.set_title(SHORT[basis])
                 else:
                     axis.set_xlabel("t (s)")
-        axes[0, 0].set_ylabel("u_y of the tip (m)"), axes[1, 0].set_ylabel("u_y, mean of the column (m)")
+        axes[0, 0].set_ylabel("$u_y$ of the tip (m)"), axes[1, 0].set_ylabel("$u_y$ of the column (m)")
         if not rows:
             return plt.close(figure)
         handles, labels = axes[1, 0].get_legend_handles_labels()

@@ -6,6 +6,7 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.colors as norms  # noqa: E402,F401
 import matplotlib.pyplot as plt  # noqa: E402
+import matplotlib.ticker as ticker  # noqa: E402
 import numpy as np  # noqa: E402
 from PIL import Image  # noqa: E402
 
@@ -39,6 +40,17 @@ def style(labels):
 def legend(axis, **options):
     if axis.get_legend_handles_labels()[0]:
         axis.legend(**options)
+
+
+def numbered(axis):
+    """Numbers at 1, 2 and 5 of a logarithmic axis (matplotlib's axis.xaxis or axis.yaxis), at powers of ten where it is
+    long: with its own labels, a decade has one number or none."""
+    low, high = sorted(axis.get_view_interval())
+    decades = np.log10(high / low)
+    axis.set_major_locator(ticker.LogLocator(subs=(1, 1.5, 2, 3, 4, 5, 7) if decades < 0.7 else (1, 2, 5) if decades < 1.6 else (1, 3) if decades < 2.6 else (1,), numticks=20))
+    axis.set_minor_locator(ticker.LogLocator(subs=range(1, 10), numticks=50))
+    axis.set_major_formatter(ticker.FuncFormatter(lambda x, _: f"{x:g}" if 1e-4 < x < 1e4 else f"$10^{{{np.log10(x):.0f}}}$" if np.log10(x) % 1 < 1e-9 else ""))
+    axis.set_minor_formatter(ticker.NullFormatter())
 
 
 def save(figure, path):

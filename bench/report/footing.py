@@ -2,7 +2,7 @@
 import numpy as np
 
 from cases import grid
-from draw import COLOURS, MARKS, SCHEME, SHORT, STYLES, curves, fields, label, plain, save, style
+from draw import COLOURS, MARKS, SCHEME, SHORT, STYLES, curves, fields, label, numbered, plain, save, style
 from measure import lattice_residual, rate, rms
 from page import Picture, Section, Table, percent
 from recordings import table
@@ -194,6 +194,7 @@ def figure_9(shelf):
         axis.set_xlabel("h/B"), axis.set_ylabel("|q / (2 + \u03c0) s_u - 1|")
         axis.set_xticks([1 / n for n in (80, 40, 20, 10)], ["1/80", "1/40", "1/20", "1/10"])
         axis.minorticks_off()
+        numbered(axis.yaxis)
         axis.legend(fontsize=6)
         save(figure, path)
 

@@ -4,6 +4,7 @@ import csv
 import dataclasses
 import datetime
 import html
+import json
 import os
 import pathlib
 import platform
@@ -128,6 +129,16 @@ def commit():
         return "unknown"
 
 
+def studied(folder):
+    """What the studies were run with: the first digits of the digest that study.Store keeps, or nothing."""
+    file = pathlib.Path(folder) / "points.jsonl"
+    if not file.exists():
+        return ""
+    with file.open() as f:
+        first = json.loads(f.readline())
+    return f"studies of one program, SHA-256 {first[1][:12]}" if first[0] == "runner" else ""
+
+
 def write_docs(parts, shelf, folder, size, docs):
     """Writes docs/report.md (of the size paper; report-SIZE.md of another), and copies the pictures into docs/report/SIZE.
     Of what write() has drawn."""
@@ -138,7 +149,7 @@ def write_docs(parts, shelf, folder, size, docs):
     there = [r for r in (shelf.get(c.name) for c in shelf.cases) if r]
     out = ["# The paper's figures with our numbers", "",
            f"Written by `make report-docs SIZE={size}` from what `make report SIZE={size}` has run: "
-           f"{len(there)} of {len(shelf.cases)} runs. `make report` writes the whole page, with every table "
+           f"{len(there)} of {len(shelf.cases)} runs{'; ' if studied(folder) else ''}{studied(folder)}. `make report` writes the whole page, with every table "
            "(`build/report/SIZE/report.html`). *standard* is without F\u0304, *zhao* is Algorithm 1 of the paper, *anchored* is our "
            "scheme (method.md). " + ("What is not run yet at full size is shown by the [small size](report-small.md). " if size == "paper" else
                                      "The paper's sizes are in [report.md](report.md). ") + "Figures are of Zhao, Jiang and Choo; theirs are not copied here.", "",
@@ -197,7 +208,7 @@ def write(parts, shelf, folder, size):
 <p>Figures 3 to 6, 8 to 10, 12 and 14 to 16 of Zhao, Jiang and Choo, <i>Circumventing volumetric locking in explicit
 material point methods</i>, as fbard computes them. Written by <code>make report SIZE={size}</code> on
 {datetime.date.today().isoformat()}, {os.cpu_count()} cores, {platform.machine()}; page of commit {commit()}, runs of
-fbard {", ".join(versions) or "-"}; {len(there)} of {len(shelf.cases)} runs are there. The pictures and the numbers
+fbard {", ".join(versions) or "-"}; {len(there)} of {len(shelf.cases)} runs are there; {studied(folder) or "no studies"}. The pictures and the numbers
 behind them lie beside this file as PNG and CSV.</p>
 <p>Words: <b>standard</b> is without F\u0304; <b>zhao</b> is Algorithm 1 of the paper; <b>anchored</b> is our F\u0304 scheme, which has
 a limit at rest (docs/method.md). Stress is positive in tension. The paper's figures are quoted, not copied; where it
