@@ -33,7 +33,8 @@ static void run(pass *work, const struct mpm_sim *sim, struct mpm_span span) {
         span.begin = order->tile[t].begin;
         span.end = order->tile[t].end;
         span.next = t + 1 < order->n_tiles ? order->tile[t + 1].begin : span.begin;
-        work(&span, &sim->results[t]);
+        struct mpm_span_result found;
+        work(&span, &found);
     }
 }
 
@@ -94,9 +95,9 @@ void stages_of(struct mpm_sim *sim) {
         memset(sim->grid.fbar, 0, nodes * (size_t)sim->grid.fbar_stride * sizeof(double));
         run(sim->kernels->p2g, sim, span);
         run(sim->kernels->g2p, sim, span);
-        mpm_walls_fold_fbar(sim->walls, sim->n_walls, &sim->grid);
+        mpm_walls_fold_fbar(sim->walls, sim->n_walls, &sim->grid, 0);
         mpm_fbar_divide(&sim->grid, 1, sim->grid.n_slots);
-        mpm_walls_mirror_fbar(sim->walls, sim->n_walls, &sim->grid);
+        mpm_walls_mirror_fbar(sim->walls, sim->n_walls, &sim->grid, 0);
         row(sim, 2, kernels->fbar, span);
     }
 }

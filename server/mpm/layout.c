@@ -8,24 +8,12 @@
 static bool lay_out(struct mpm_sim *sim) {
     const enum mpm_basis basis = sim->def->basis;
     mpm_grid_deactivate(&sim->grid);
-    size_t most = 0;
+    sim->n_shared = 0;
     for (size_t b = 0; b < sim->n_sets; b++) {
         if (!mpm_order_colour(&sim->orders[b], &sim->grid, basis) ||
             !mpm_order_activate(&sim->orders[b], &sim->grid, basis)) {
             return false;
         }
-        const size_t tiles = sim->orders[b].n_tiles, chunks = sim->sets[b].n / MPM_CHUNK + 1;
-        most = tiles > most ? tiles : most;
-        most = chunks > most ? chunks : most;
-    }
-    if (most > sim->n_results) {
-        struct mpm_span_result *results =
-            realloc(sim->results, (most + most / 2) * sizeof *results);
-        if (!results) {
-            return false;
-        }
-        sim->results = results;
-        sim->n_results = most + most / 2;
     }
     return mpm_walls_activate(sim->walls, sim->n_walls, &sim->grid) &&
            mpm_grid_connect(&sim->grid) &&

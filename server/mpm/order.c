@@ -44,6 +44,7 @@ void mpm_order_free(struct mpm_order *order) {
     free(order->before_begin);
     free(order->before);
     free(order->work_before);
+    free(order->chunk);
     free(order->done);
     free(order->share);
     free(order->when);
@@ -67,7 +68,8 @@ bool mpm_order_reserve(struct mpm_order *order, size_t n) {
     if (!resize(&order->tile, room * sizeof *order->tile) || !resize(&order->colour, room) ||
         !resize(&order->before_begin, (room + 1) * sizeof *order->before_begin) ||
         !resize(&order->work_before, (room + 1) * sizeof *order->work_before) ||
-        !resize(&order->done, room * sizeof *order->done) ||
+        !resize(&order->chunk, (room + 1) * sizeof *order->chunk) ||
+        !resize(&order->done, room * MPM_APART * sizeof *order->done) ||
         !resize(&order->share, room * sizeof *order->share) || !resize(&order->when, room)) {
         return false;
     }
@@ -282,10 +284,12 @@ static void find_before(struct mpm_order *order, const struct mpm_grid *grid, co
 bool mpm_order_colour(struct mpm_order *order, const struct mpm_grid *grid, enum mpm_basis basis) {
     const int along = colours_along(basis), dim = grid->dim, width = 2 * along - 1;
     order->n_colours = dim == 2 ? along * along : along * along * along;
-    order->n_parts = 0;
+    order->n_chunks = 0;
     if (order->n_tiles == 0) {
         return true;
     }
+    const size_t n = order->tile[order->n_tiles - 1].end;
+    const size_t least = n / 16 < MPM_FEWEST ? MPM_FEWEST : n / 16 > MPM_MOST ? MPM_MOST : n / 16;
     uint64_t work = 0;
     for (size_t t = 0; t < order->n_tiles; t++) {
         int place[MPM_MAX_DIM], colour = 0;
@@ -296,8 +300,13 @@ bool mpm_order_colour(struct mpm_order *order, const struct mpm_grid *grid, enum
         order->colour[t] = (uint8_t)colour;
         order->work_before[t] = work;
         work += order->tile[t].end - order->tile[t].begin + TILE_WORK;
-        atomic_init(&order->done[t], order->pass);
+        atomic_init(&order->done[t * MPM_APART], order->pass);
+        const size_t last = order->n_chunks > 0 ? order->chunk[order->n_chunks - 1] : 0;
+        if (order->n_chunks == 0 || order->tile[t].begin - order->tile[last].begin >= least) {
+            order->chunk[order->n_chunks++] = (uint32_t)t;
+        }
     }
+    order->chunk[order->n_chunks] = (uint32_t)order->n_tiles;
     order->work_before[order->n_tiles] = work;
     memset(order->before_begin, 0, (order->n_tiles + 1) * sizeof *order->before_begin);
     for (int write = 0; write < 2; write++) { // first their numbers, then they themselves
@@ -317,40 +326,48 @@ bool mpm_order_colour(struct mpm_order *order, const struct mpm_grid *grid, enum
         for (size_t t = 0; t < order->n_tiles; t++) {
             order->before_begin[t + 1] += order->before_begin[t];
         }
-        const size_t n = order->before_begin[order->n_tiles];
-        if (n > order->before_capacity) {
-            if (!resize(&order->before, (n + n / 2) * sizeof *order->before)) {
+        const size_t n_before = order->before_begin[order->n_tiles];
+        if (n_before > order->before_capacity) {
+            if (!resize(&order->before, (n_before + n_before / 2) * sizeof *order->before)) {
                 return false;
             }
-            order->before_capacity = n + n / 2;
+            order->before_capacity = n_before + n_before / 2;
         }
     }
     return true;
 }
 
-size_t mpm_order_part(const struct mpm_order *order, int k, int n) {
-    const uint64_t wanted =
-        order->n_tiles == 0 ? 0 : order->work_before[order->n_tiles] * (uint64_t)k / (uint64_t)n;
-    size_t lo = 0, hi = order->n_tiles;
-    while (lo < hi) { // the first tile with at least so much before it
+static uint64_t work_before_chunk(const struct mpm_order *order, size_t chunk) {
+    return order->work_before[order->chunk[chunk]];
+}
+
+size_t mpm_order_cut(const struct mpm_order *order, double share) {
+    if (order->n_tiles == 0) {
+        return 0;
+    }
+    const double wanted = share * (double)order->work_before[order->n_tiles];
+    size_t lo = 0, hi = order->n_chunks;
+    while (lo < hi) { // the first chunk with at least so much before it
         const size_t middle = lo + (hi - lo) / 2;
-        if (order->work_before[middle] < wanted) {
+        if ((double)work_before_chunk(order, middle) < wanted) {
             lo = middle + 1;
         } else {
             hi = middle;
         }
     }
-    return lo;
+    const bool nearer = lo > 0 && wanted - (double)work_before_chunk(order, lo - 1) <
+                                      (double)work_before_chunk(order, lo) - wanted;
+    return nearer ? lo - 1 : lo;
 }
 
 // When a part comes to a tile: first those that tiles of other parts wait for, last those that wait
 // for tiles of other parts, each with what has to come before or after it.
 enum when { BETWEEN, FIRST, LAST, PLACED };
 
-static void find_first_and_last(struct mpm_order *order, int n) {
+static void find_first_and_last(struct mpm_order *order, const uint32_t *parts, int n) {
     memset(order->when, BETWEEN, order->n_tiles);
     for (int k = 0; k < n; k++) {
-        const size_t begin = mpm_order_part(order, k, n), end = mpm_order_part(order, k + 1, n);
+        const size_t begin = order->chunk[parts[k]], end = order->chunk[parts[k + 1]];
         for (size_t t = begin; t < end; t++) {
             for (uint32_t b = order->before_begin[t]; b < order->before_begin[t + 1]; b++) {
                 const uint32_t q = order->before[b];
@@ -365,7 +382,7 @@ static void find_first_and_last(struct mpm_order *order, int n) {
         const bool down = step < order->n_colours;
         const int colour = down ? order->n_colours - 1 - step : step - order->n_colours;
         for (int k = 0; k < n; k++) {
-            const size_t begin = mpm_order_part(order, k, n), end = mpm_order_part(order, k + 1, n);
+            const size_t begin = order->chunk[parts[k]], end = order->chunk[parts[k + 1]];
             for (size_t t = begin; t < end; t++) {
                 if (order->colour[t] != colour || (down && order->when[t] != FIRST)) {
                     continue;
@@ -409,10 +426,13 @@ static size_t share_in_place(struct mpm_order *order, size_t t, size_t at) {
     return at + 1;
 }
 
-void mpm_order_share(struct mpm_order *order, int n) {
-    find_first_and_last(order, n);
+void mpm_order_share(struct mpm_order *order, const uint32_t *parts, int n) {
+    if (order->n_tiles == 0) {
+        return;
+    }
+    find_first_and_last(order, parts, n);
     for (int k = 0; k < n; k++) {
-        const size_t begin = mpm_order_part(order, k, n), end = mpm_order_part(order, k + 1, n);
+        const size_t begin = order->chunk[parts[k]], end = order->chunk[parts[k + 1]];
         size_t at = share_by_colour(order, begin, end, FIRST, begin);
         for (size_t t = begin; t < end; t++) {
             if (order->when[t] == BETWEEN) {
@@ -421,7 +441,6 @@ void mpm_order_share(struct mpm_order *order, int n) {
         }
         share_by_colour(order, begin, end, LAST, at);
     }
-    order->n_parts = n;
 }
 
 // The nodes that a particle of a cell can reach while it drifts by less than a cell are

@@ -23,6 +23,10 @@ struct mpm_tile {
     uint64_t cells;      // bits: the cells of the block (place of the first node) in use
 };
 
+#define MPM_APART 16   // numbers, so that each has a cache line of its own
+#define MPM_FEWEST 128 // particles of a chunk, and a sixteenth of the body's up to MPM_MOST
+#define MPM_MOST 512
+
 struct mpm_order {
     size_t n_tiles, capacity;
     struct mpm_tile *tile; // by block
@@ -32,14 +36,18 @@ struct mpm_order {
                                      // tiles near it with lower colours
     size_t before_capacity;
     uint64_t
-        *work_before;  // (n_tiles + 1) particles of the tiles before, and what tiles cost besides
-    atomic_uint *done; // (n_tiles) the pass in which a tile has last been done
+        *work_before; // (n_tiles + 1) particles of the tiles before, and what tiles cost besides
+    // Chunks of tiles that follow each other, of so many particles or more: whatever a pass works
+    // by, tiles or chunks, the cuts between the parts fall between the same particles, since to
+    // move a particle from one core's cache to another's takes longer than all else that is done
+    // with it. Never depends on the number of threads: sums go by chunks.
+    uint32_t *chunk; // (n_chunks + 1) first tile of each, and n_tiles
+    size_t n_chunks;
+    atomic_uint *done; // (n_tiles, MPM_APART) the pass in which a tile has last been done
     unsigned pass;
-    // The tiles in parts of about equal work, each in an order that keeps what they wait for and
-    // is near that of memory: shares [mpm_order_part(k), mpm_order_part(k + 1)) are part k of
-    // n_parts (0: not shared out yet).
+    // The tiles in parts of chunks, each in an order that keeps what they wait for and is near that
+    // of memory.
     uint32_t *share;
-    int n_parts;
     uint8_t *when; // (n_tiles) for sharing out
 };
 
@@ -65,10 +73,10 @@ bool mpm_order_sort(struct mpm_order *order, struct mpm_particles *s, const stru
 // Gives the tiles their colours and finds what they wait for: after they were found or restored.
 // False when memory is short.
 bool mpm_order_colour(struct mpm_order *order, const struct mpm_grid *grid, enum mpm_basis basis);
-// Shares the tiles out in n parts.
-void mpm_order_share(struct mpm_order *order, int n);
-// Where part k of n begins; n ends the last.
-size_t mpm_order_part(const struct mpm_order *order, int k, int n);
+// The chunk before which there is about a share (0 to 1) of the body's work.
+size_t mpm_order_cut(const struct mpm_order *order, double share);
+// Shares the tiles out in n parts, of which part k begins with chunk parts[k], and n ends the last.
+void mpm_order_share(struct mpm_order *order, const uint32_t *parts, int n);
 // Gives every block that particles of the tiles can reach before the next sort its slot. False when
 // memory is short.
 bool mpm_order_activate(const struct mpm_order *order, struct mpm_grid *grid, enum mpm_basis basis);

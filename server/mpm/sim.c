@@ -489,12 +489,15 @@ enum mpm_status mpm_create(const struct mpm_def *def, struct mpm_sim **out, stru
     for (size_t b = 0; b < sim->n_sets; b++) {
         largest = sim->sets[b].n > largest ? sim->sets[b].n : largest;
     }
-    sim->turns = aligned_alloc(64, (size_t)def->n_threads * sizeof *sim->turns);
-    sim->team = aligned_alloc(64, sizeof *sim->team);
-    if (!sim->turns || !sim->team) {
+    sim->turns = aligned_alloc(128, (size_t)def->n_threads * sizeof *sim->turns);
+    sim->team = mpm_team_create(def->n_threads);
+    sim->mass_dx = calloc(largest / MPM_FEWEST + 1, sizeof *sim->mass_dx);
+    sim->parts = calloc(sim->n_sets * ((size_t)def->n_threads + 1), sizeof *sim->parts);
+    sim->cut = calloc((size_t)def->n_threads + 1, sizeof *sim->cut);
+    if (!sim->turns || !sim->team || !sim->mass_dx || !sim->cut || !sim->parts) {
         goto fail;
     }
-    mpm_team_create(sim->team, def->n_threads);
+    memset(sim->turns, 0, (size_t)def->n_threads * sizeof *sim->turns);
     if (!mpm_sorter_create(&sim->sorter, largest, sim->team) || !create_probes(sim) ||
         !create_body_forces(sim) || !mpm_provide_fbar(sim, widest_fbar(def))) {
         goto fail;
@@ -533,8 +536,10 @@ void mpm_free(struct mpm_sim *sim) {
     }
     mpm_sorter_free(&sim->sorter);
     mpm_smooth_free(sim->smooth);
-    free(sim->team);
+    mpm_team_free(sim->team);
     free(sim->turns);
+    free(sim->cut);
+    free(sim->parts);
     for (size_t k = 0; sim->walls && k < sim->n_walls; k++) {
         mpm_wall_free(&sim->walls[k]);
     }
@@ -558,7 +563,7 @@ void mpm_free(struct mpm_sim *sim) {
     free(sim->walls);
     free(sim->loads);
     free(sim->rigids);
-    free(sim->results);
+    free(sim->mass_dx);
     free(sim->averages);
     free(sim->probe_set);
     free(sim->probe_particle);

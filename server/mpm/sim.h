@@ -12,7 +12,6 @@
 #include "server/mpm/smooth.h"
 #include "server/mpm/transfer.h"
 
-#define MPM_CHUNK 256 // particles of work that is not by tiles; never depends on the thread count
 #define MPM_AVERAGE_SLOTS 64 // points of a probe's running integral kept over its averaging window
 
 // Running integral of a probe's value over time, for its moving mean.
@@ -44,12 +43,14 @@ struct mpm_clockwork {
     uint64_t runs_at_sort, runs; // particles of one cell in a row: after the sort, and now
 };
 
-// Which tile or chunk of a thread's part is next, where the part ends, and which slots of the grid
-// are its part of the nodes; a cache line for each.
+// Which tile or chunk of a thread's part is next, where the part ends, and what the thread has
+// found; cache lines for each.
 struct mpm_turn {
-    _Alignas(64) atomic_size_t next;
-    size_t end;
-    uint32_t first_slot, last_slot; // [first, last)
+    _Alignas(128) _Atomic uint64_t next;       // and the end
+    _Alignas(64) struct mpm_span_result found; // but for sums
+    // Since the last sort: at work, without waiting, s, and on how many particles, pass by pass.
+    double seconds, work;
+    double speed, share; // particles a second before that, and its share of all work
 };
 
 struct mpm_sim {
@@ -58,18 +59,22 @@ struct mpm_sim {
     const struct mpm_kernels *kernels, *plain; // of that instruction set, and of the baseline
     struct mpm_grid grid;
     double exit_min[MPM_MAX_DIM], exit_max[MPM_MAX_DIM]; // m: a particle beyond them has left
-    size_t n_sets, n_walls, n_loads, n_rigids, n_particles, n_results;
+    size_t n_sets, n_walls, n_loads, n_rigids, n_particles;
     struct mpm_particles *sets; // one a body
     struct mpm_order *orders;   // one a body
     struct mpm_team *team;
     struct mpm_sorter sorter;
     struct mpm_turn *turns; // (n_threads)
+    uint32_t *parts;        // (n_sets, n_threads + 1) first chunk of each thread's part of a body
+    uint32_t *cut; // (n_threads + 1) thread k has the nodes of the slots [cut[k], cut[k + 1])
+    int n_shared;  // threads to which nodes and walls are shared out; 0 after a sort
+    bool walls_in_common;
     struct mpm_wall *walls;
     struct mpm_load *loads;
     struct mpm_rigid *rigids;
-    struct mpm_span_result *results; // one a tile or chunk of the body with the most
-    struct mpm_average *averages;    // (n_probes), NULL where no probe averages
-    size_t *probe_particle;          // (n_probes) set and id of the particle of a probe at a point
+    double (*mass_dx)[MPM_MAX_DIM]; // (chunks of the largest body) what each found, kg m
+    struct mpm_average *averages;   // (n_probes), NULL where no probe averages
+    size_t *probe_particle;         // (n_probes) set and id of the particle of a probe at a point
     size_t *probe_set;
     struct mpm_compare *compares;       // (n_probes)
     struct mpm_body_force *body_forces; // (n_sets), NULL without a body force

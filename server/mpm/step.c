@@ -19,67 +19,140 @@ struct nodes_work {
     bool fbar;
 };
 
-static void share_nodes(struct mpm_sim *sim) {
+static uint32_t *parts_of(const struct mpm_sim *sim, size_t body) {
+    return sim->parts + body * ((size_t)sim->def->n_threads + 1);
+}
+
+// What threads get through in a second differs: with what flows in their parts, and with what else
+// wants their cores. So each one's share follows what it did with the last; nothing that is
+// computed depends on the shares.
+static void follow_speeds(struct mpm_sim *sim, int n) {
+    double all = 0, speeds = 0;
+    for (int k = 0; k < n; k++) {
+        struct mpm_turn *turn = &sim->turns[k];
+        turn->speed = turn->seconds > 0 ? turn->work / turn->seconds : 0;
+        turn->share = turn->share > 0 ? turn->share : 1.0 / n;
+        speeds += turn->speed;
+        turn->work = turn->seconds = 0;
+    }
+    for (int k = 0; k < n; k++) {
+        struct mpm_turn *turn = &sim->turns[k];
+        const double wanted = turn->speed > 0 ? turn->speed / speeds : 1.0 / n;
+        turn->share += 0.5 * (fmin(fmax(wanted, 0.5 / n), 2.0 / n) - turn->share);
+        all += turn->share;
+    }
+    for (int k = 0; k < n; k++) {
+        sim->turns[k].share /= all;
+    }
+}
+
+static void share_out(struct mpm_sim *sim) {
     const int n = sim->team->n_there;
+    if (sim->n_shared == n) {
+        return;
+    }
+    follow_speeds(sim, n);
     size_t most = 0;
-    for (size_t b = 1; b < sim->n_sets; b++) {
+    for (size_t b = 0; b < sim->n_sets; b++) {
+        struct mpm_order *order = &sim->orders[b];
+        uint32_t *parts = parts_of(sim, b);
+        double before = 0;
         most = sim->sets[b].n > sim->sets[most].n ? b : most;
+        for (int k = 0; k < n; k++) {
+            parts[k] = (uint32_t)mpm_order_cut(order, before);
+            before += sim->turns[k].share;
+        }
+        parts[n] = (uint32_t)order->n_chunks;
+        mpm_order_share(order, parts, n);
     }
     const struct mpm_order *order = &sim->orders[most];
-    uint32_t slot = 0;
-    for (int k = 0; k < n; k++) {
-        sim->turns[k].first_slot = slot;
-        const size_t t = k + 1 < n ? mpm_order_part(order, k + 1, n) : order->n_tiles;
-        const uint32_t cut =
+    for (int k = 1; k < n; k++) {
+        const size_t t = order->chunk[parts_of(sim, most)[k]];
+        const uint32_t slot =
             t < order->n_tiles ? sim->grid.slot[order->tile[t].block] : sim->grid.n_slots;
-        slot = cut > slot ? cut : slot;
-        sim->turns[k].last_slot = slot;
+        sim->cut[k] = slot > sim->cut[k - 1] ? slot : sim->cut[k - 1];
     }
+    sim->cut[n] = sim->grid.n_slots;
+    sim->walls_in_common = mpm_walls_share(sim->walls, sim->n_walls, &sim->grid, sim->cut, n);
+    sim->n_shared = n;
 }
 
-// Slot 0, where no block is, is only cleared.
-static void clear_nodes(void *context, int own, int there) {
-    const struct nodes_work *w = context;
-    const struct mpm_grid *grid = &w->sim->grid;
-    const struct mpm_turn *part = &w->sim->turns[own];
-    const size_t nodes = (size_t)MPM_BLOCK_NODES(grid->dim), scalars = (size_t)grid->fbar_stride;
-    const size_t first = part->first_slot * nodes, n = part->last_slot * nodes - first;
+// A thread's share of an array of nodes, with slot 0, where no block is.
+static void clear(const struct mpm_sim *sim, double *array, int width, int own) {
+    const size_t block = (size_t)MPM_BLOCK_NODES(sim->grid.dim) * (size_t)width;
+    memset(array + sim->cut[own] * block, 0,
+           (sim->cut[own + 1] - sim->cut[own]) * block * sizeof(double));
+}
+
+// The sums of a step are cleared for the next one as soon as they have been read, by who has them
+// in its cache: so this is work of its own only after a sort.
+static void clear_sums(void *context, int own, int there) {
+    const struct mpm_sim *sim = context;
     (void)there;
-    memset(grid->node + first * MPM_NODE, 0, n * MPM_NODE * sizeof(double));
-    if (w->fbar) {
-        memset(grid->fbar + first * scalars, 0, n * scalars * sizeof(double));
-    }
+    clear(sim, sim->grid.node, MPM_NODE, own);
 }
 
+// What walls have in common is done by one thread: no other touches it before the barrier.
 static void move_nodes(void *context, int own, int there) {
     const struct nodes_work *w = context;
-    const struct mpm_turn *part = &w->sim->turns[own];
-    const uint32_t first = part->first_slot > 0 ? part->first_slot : 1;
-    (void)there;
-    if (first < part->last_slot) {
-        w->sim->kernels->move_nodes(&w->sim->grid, first, part->last_slot, &w->motion);
+    struct mpm_sim *sim = w->sim;
+    struct mpm_grid *grid = &sim->grid;
+    const double *g = w->motion.gravity, dt = w->motion.dt;
+    const uint32_t first = sim->cut[own] > 0 ? sim->cut[own] : 1, last = sim->cut[own + 1];
+    mpm_walls_fold(sim->walls, sim->n_walls, grid, g, dt, own);
+    if (sim->walls_in_common) {
+        if (own == 0) {
+            mpm_walls_fold(sim->walls, sim->n_walls, grid, g, dt, there);
+        }
+        mpm_team_barrier(sim->team, there);
+    }
+    if (first < last) {
+        sim->kernels->move_nodes(grid, first, last, &w->motion);
+    }
+    if (w->fbar) {
+        clear(sim, grid->fbar, grid->fbar_stride, own);
+    }
+    mpm_walls_apply(sim->walls, sim->n_walls, grid, g, dt, own);
+    if (sim->walls_in_common) {
+        mpm_team_barrier(sim->team, there);
+        if (own == 0) {
+            mpm_walls_apply(sim->walls, sim->n_walls, grid, g, dt, there);
+        }
     }
 }
 
 static void divide_nodes(void *context, int own, int there) {
     struct mpm_sim *sim = context;
-    const struct mpm_turn *part = &sim->turns[own];
-    (void)there;
-    mpm_fbar_divide(&sim->grid, part->first_slot > 0 ? part->first_slot : 1, part->last_slot);
+    struct mpm_grid *grid = &sim->grid;
+    mpm_walls_fold_fbar(sim->walls, sim->n_walls, grid, own);
+    if (sim->walls_in_common) {
+        if (own == 0) {
+            mpm_walls_fold_fbar(sim->walls, sim->n_walls, grid, there);
+        }
+        mpm_team_barrier(sim->team, there);
+    }
+    mpm_fbar_divide(grid, sim->cut[own] > 0 ? sim->cut[own] : 1, sim->cut[own + 1]);
+    clear(sim, grid->node, MPM_NODE, own);
+    mpm_walls_mirror_fbar(sim->walls, sim->n_walls, grid, own);
+    if (sim->walls_in_common) {
+        mpm_team_barrier(sim->team, there);
+        if (own == 0) {
+            mpm_walls_mirror_fbar(sim->walls, sim->n_walls, grid, there);
+        }
+    }
 }
 
-static void join(struct mpm_span_result *joined, const struct mpm_span_result *r,
-                 const struct mpm_particles *s) {
-    for (int d = 0; d < s->dim; d++) {
+// All but the sums, which are not the same in any order.
+static void join(struct mpm_span_result *joined, const struct mpm_span_result *r, int dim) {
+    for (int d = 0; d < dim; d++) {
         joined->min[d] = r->min[d] < joined->min[d] ? r->min[d] : joined->min[d];
         joined->max[d] = r->max[d] > joined->max[d] ? r->max[d] : joined->max[d];
-        joined->mass_dx[d] += r->mass_dx[d];
     }
     joined->v2_max = r->v2_max > joined->v2_max ? r->v2_max : joined->v2_max;
     joined->dx_max = r->dx_max > joined->dx_max ? r->dx_max : joined->dx_max;
     joined->n_runs += r->n_runs;
-    if (joined->bad == SIZE_MAX && r->bad != SIZE_MAX) {
-        joined->bad = s->first_id + s->id[r->bad];
+    if (r->bad < joined->bad) {
+        joined->bad = r->bad;
         joined->status = r->status;
         joined->value = r->value;
     }
@@ -88,30 +161,65 @@ static void join(struct mpm_span_result *joined, const struct mpm_span_result *r
 typedef void span_work(const struct mpm_sim *sim, const struct mpm_span *span,
                        struct mpm_span_result *result);
 
-static void work_on(const struct mpm_sim *sim, struct mpm_span span, size_t begin, size_t end,
-                    size_t next, span_work *work, struct mpm_span_result *result) {
-    span.begin = begin;
-    span.end = end;
-    span.next = next;
-    work(sim, &span, result);
-}
-
 struct particles_work {
     const struct mpm_sim *sim;
     struct mpm_order *order;
     struct mpm_span span;
     span_work *work;
-    int n_parts; // one a thread
+    const uint32_t *parts; // (n_parts + 1) first chunk of each
+    int n_parts;           // one a thread
+    bool clears_sums;      // which nobody will read any more
 };
 
-// The next of a part, if there is one. Of another's part only while more than one is left: what
-// lies in another core's cache takes longer to fetch than to work on.
-static bool take(struct mpm_turn *turn, bool own, size_t *next) {
-    if (!own && atomic_load_explicit(&turn->next, memory_order_relaxed) + 1 >= turn->end) {
-        return false;
+static void work_on(const struct particles_work *w, size_t begin, size_t end, size_t next,
+                    struct mpm_span_result *found, double *mass_dx) {
+    struct mpm_span span = w->span;
+    struct mpm_span_result result;
+    span.begin = begin;
+    span.end = end;
+    span.next = next;
+    w->work(w->sim, &span, &result);
+    join(found, &result, span.s->dim);
+    if (mass_dx) {
+        memcpy(mass_dx, result.mass_dx, sizeof result.mass_dx);
     }
-    *next = atomic_fetch_add(&turn->next, 1);
-    return *next < turn->end;
+}
+
+#define MUCH 3 // one of so many parts is
+
+// A part's next tile or chunk in the lower half of its turn, the end in the upper one. Its own
+// thread sets it as it begins; until then, as at the end of all work, nothing is left.
+static void begin_turn(struct mpm_turn *turn, size_t begin, size_t end) {
+    atomic_store_explicit(&turn->next, (uint64_t)end << 32 | begin, memory_order_release);
+}
+
+// The next of a part, if there is one. Of another's part only while much of it is left, as when its
+// thread lost its core: what lies in another core's cache takes longer to fetch than to work on.
+static bool take(struct mpm_turn *turn, bool own, size_t n, size_t *next) {
+    if (!own) {
+        const uint64_t now = atomic_load_explicit(&turn->next, memory_order_relaxed);
+        if ((now & UINT32_MAX) + n / MUCH >= now >> 32) {
+            return false;
+        }
+    }
+    const uint64_t now = atomic_fetch_add_explicit(&turn->next, 1, memory_order_acquire);
+    *next = now & UINT32_MAX;
+    return *next < now >> 32;
+}
+
+static double now_or_zero(const struct mpm_sim *sim) {
+    return sim->def->clock ? sim->def->clock() : 0;
+}
+
+// What a thread has found, on how many particles, and since when: for follow_speeds.
+static void end_turn(const struct mpm_sim *sim, int own, const struct mpm_span_result *found,
+                     size_t work, double since) {
+    struct mpm_turn *turn = &sim->turns[own];
+    turn->found = *found;
+    if (since > 0) {
+        turn->work += (double)work;
+        turn->seconds += now_or_zero(sim) - since;
+    }
 }
 
 // Work that adds to the grid goes tile by tile. A tile waits for those near it with lower colours,
@@ -124,85 +232,109 @@ static void work_on_tiles(void *context, int own, int there) {
     const struct particles_work *w = context;
     const struct mpm_order *order = w->order;
     struct mpm_team *team = w->sim->team;
+    struct mpm_span_result found = mpm_nothing_found();
+    double since = there > 1 ? now_or_zero(w->sim) : 0;
+    size_t work = 0;
     for (int k = 0; k < w->n_parts; k++) {
-        struct mpm_turn *turn = &w->sim->turns[(own + k) % w->n_parts];
-        for (size_t i; take(turn, k == 0, &i);) {
-            const uint32_t t = order->share[i], next = order->share[i + 1 < turn->end ? i + 1 : i];
+        const int part = (own + k) % w->n_parts;
+        struct mpm_turn *turn = &w->sim->turns[part];
+        const size_t begin = order->chunk[w->parts[part]], end = order->chunk[w->parts[part + 1]];
+        if (k == 0) {
+            begin_turn(turn, begin, end);
+        }
+        for (size_t i; take(turn, k == 0, end - begin, &i);) {
+            const uint32_t t = order->share[i], next = order->share[i + 1 < end ? i + 1 : i];
             for (uint32_t q = order->before_begin[t]; there > 1 && q < order->before_begin[t + 1];
                  q++) {
-                atomic_uint *done = &order->done[order->before[q]];
-                for (unsigned pass; (pass = atomic_load(done)) != order->pass;) {
+                atomic_uint *done = &order->done[order->before[q] * (size_t)MPM_APART];
+                for (unsigned pass;
+                     (pass = atomic_load_explicit(done, memory_order_acquire)) != order->pass;) {
+                    const double waits = now_or_zero(w->sim);
                     mpm_team_await(team, done, pass);
+                    since += now_or_zero(w->sim) - waits;
                 }
             }
-            work_on(w->sim, w->span, order->tile[t].begin, order->tile[t].end,
-                    order->tile[next].begin, w->work, &w->sim->results[t]);
+            work_on(w, order->tile[t].begin, order->tile[t].end, order->tile[next].begin, &found,
+                    NULL);
+            work += order->tile[t].end - order->tile[t].begin;
             if (there > 1) {
-                atomic_store(&order->done[t], order->pass);
-                mpm_team_tell(team, &order->done[t]);
+                atomic_uint *done = &order->done[t * (size_t)MPM_APART];
+                atomic_store_explicit(done, order->pass, memory_order_release);
+                mpm_team_tell(team, done);
             }
         }
     }
+    end_turn(w->sim, own, &found, work, since);
 }
 
 static void for_tiles(struct particles_work *w) {
-    const int n_parts = w->n_parts;
-    if (w->order->n_parts != n_parts) {
-        mpm_order_share(w->order, n_parts);
-    }
     w->order->pass++;
-    for (int k = 0; k < n_parts; k++) {
-        atomic_store(&w->sim->turns[k].next, mpm_order_part(w->order, k, n_parts));
-        w->sim->turns[k].end = mpm_order_part(w->order, k + 1, n_parts);
-    }
     mpm_team_run(w->sim->team, work_on_tiles, w);
 }
 
-// All other work goes in chunks of equal size, in the same parts to a chunk, so that particles stay
-// with their core. They do not take equal time, since what flows costs more.
+// In whole blocks of particles: of one that two tiles share no lane is idle.
+static size_t chunk_begin(const struct mpm_order *order, size_t chunk) {
+    return order->tile[order->chunk[chunk]].begin / MPM_BLOCK * MPM_BLOCK;
+}
+
+// All other work goes by chunks, in the same parts. They do not take equal time, since what flows
+// costs more.
 static void work_on_chunks(void *context, int own, int there) {
     const struct particles_work *w = context;
+    const struct mpm_order *order = w->order;
     const size_t n = w->span.s->n;
-    (void)there;
+    if (w->clears_sums) {
+        clear_sums((void *)w->sim, own, there);
+    }
+    struct mpm_span_result found = mpm_nothing_found();
+    double since = there > 1 ? now_or_zero(w->sim) : 0;
+    size_t work = 0;
     for (int k = 0; k < w->n_parts; k++) {
-        struct mpm_turn *turn = &w->sim->turns[(own + k) % w->n_parts];
-        for (size_t i; take(turn, k == 0, &i);) {
-            const size_t begin = i * MPM_CHUNK, end = begin + MPM_CHUNK;
-            work_on(w->sim, w->span, begin, end < n ? end : n, end < n ? end : begin, w->work,
-                    &w->sim->results[i]);
+        const int part = (own + k) % w->n_parts;
+        struct mpm_turn *turn = &w->sim->turns[part];
+        const size_t first = w->parts[part], last = w->parts[part + 1];
+        if (k == 0) {
+            begin_turn(turn, first, last);
+        }
+        for (size_t i; take(turn, k == 0, last - first, &i);) {
+            const size_t end = i + 1 < order->n_chunks ? chunk_begin(order, i + 1) : n;
+            work_on(w, chunk_begin(order, i), end, end < n ? end : 0, &found, w->sim->mass_dx[i]);
+            work += end - chunk_begin(order, i);
         }
     }
+    end_turn(w->sim, own, &found, work, since);
 }
 
-static size_t for_chunks(struct particles_work *w) {
-    const size_t n_chunks = (w->span.s->n + MPM_CHUNK - 1) / MPM_CHUNK;
-    size_t begin = 0;
-    for (int k = 0; k < w->n_parts; k++) {
-        const size_t tile = mpm_order_part(w->order, k + 1, w->n_parts);
-        const size_t end = tile < w->order->n_tiles
-                               ? (w->order->tile[tile].begin + MPM_CHUNK / 2) / MPM_CHUNK
-                               : n_chunks;
-        atomic_store(&w->sim->turns[k].next, begin);
-        begin = w->sim->turns[k].end = end;
+// Work that adds to the grid, or that moves particles: with what they found, the sums in the order
+// of the chunks.
+static void for_particles(const struct mpm_sim *sim, size_t body, struct particles_work w,
+                          bool adds, struct mpm_span_result *joined) {
+    const struct mpm_particles *s = w.span.s = &sim->sets[body];
+    w.span.grid = (struct mpm_grid *)&sim->grid;
+    w.sim = sim;
+    w.order = &sim->orders[body];
+    if (w.order->n_tiles == 0) {
+        return;
     }
-    mpm_team_run(w->sim->team, work_on_chunks, w);
-    return n_chunks;
-}
-
-// What was found is joined in the order of the tiles or chunks.
-static void for_particles(const struct mpm_sim *sim, size_t body, struct mpm_span span, bool adds,
-                          span_work *work, struct mpm_span_result *joined) {
-    span.s = &sim->sets[body];
-    span.grid = (struct mpm_grid *)&sim->grid;
-    struct particles_work w = {sim, &sim->orders[body], span, work, sim->team->n_there};
-    size_t n = sim->orders[body].n_tiles;
+    w.parts = parts_of(sim, body);
+    w.n_parts = sim->team->n_there;
     if (adds) {
         for_tiles(&w);
     } else {
-        n = for_chunks(&w);
+        mpm_team_run(sim->team, work_on_chunks, &w);
     }
-    for (size_t k = 0; k < n; k++) {
-        join(joined, &sim->results[k], span.s);
+    struct mpm_span_result found = mpm_nothing_found();
+    for (int k = 0; k < w.n_parts; k++) {
+        join(&found, &sim->turns[k].found, s->dim);
+    }
+    if (found.bad != SIZE_MAX) { // what an earlier pass or body found comes first
+        found.bad = joined->bad == SIZE_MAX ? s->first_id + s->id[found.bad] : SIZE_MAX;
+    }
+    join(joined, &found, s->dim);
+    for (size_t k = 0; !adds && k < w.order->n_chunks; k++) {
+        for (int d = 0; d < s->dim; d++) {
+            joined->mass_dx[d] += sim->mass_dx[k][d];
+        }
     }
 }
 
@@ -289,10 +421,6 @@ static enum mpm_status check_result(const struct mpm_sim *sim, const struct mpm_
     return MPM_OK;
 }
 
-static double now_or_zero(const struct mpm_sim *sim) {
-    return sim->def->clock ? sim->def->clock() : 0;
-}
-
 // Adds the time since *since to a phase.
 static void charge(struct mpm_sim *sim, enum mpm_phase phase, double *since) {
     const double now = now_or_zero(sim);
@@ -377,11 +505,14 @@ static bool sort_is_due(const struct mpm_sim *sim) {
 // eqs. 7, 8, 10, and the forces of loads and rigid bodies.
 static void particles_to_grid(struct mpm_sim *sim, double dt, bool any_fbar, double *clock) {
     struct mpm_span_result found = mpm_nothing_found();
-    share_nodes(sim);
-    mpm_team_run(sim->team, clear_nodes, &(struct nodes_work){.sim = sim, .fbar = any_fbar});
+    share_out(sim);
+    if (!sim->grid.sums_are_clear) {
+        mpm_team_run(sim->team, clear_sums, sim);
+    }
+    sim->grid.sums_are_clear = false;
     for (size_t b = 0; b < sim->n_sets; b++) {
         const struct mpm_span span = {.dt = dt, .fbar = any_fbar && sim->sets[b].wants_fbar};
-        for_particles(sim, b, span, true, p2g, &found);
+        for_particles(sim, b, (struct particles_work){.span = span, .work = p2g}, true, &found);
     }
     sim->c.runs = found.n_runs;
     sim->c.runs_at_sort = sim->c.steps_since_sort == 0 ? found.n_runs : sim->c.runs_at_sort;
@@ -445,14 +576,13 @@ static enum mpm_status step(struct mpm_sim *sim, struct mpm_error *err) {
     particles_to_grid(sim, dt, any_fbar, &clock);
 
     // Grid, eq. 9, and boundary conditions
-    mpm_walls_fold(sim->walls, sim->n_walls, &sim->grid, gravity, dt);
     struct nodes_work motion = {.sim = sim,
+                                .fbar = any_fbar,
                                 .motion = {.dt = dt,
                                            .local = now->damping_local,
                                            .mass = now->damping_mass,
                                            .gravity = {gravity[0], gravity[1], gravity[2]}}};
     mpm_team_run(sim->team, move_nodes, &motion);
-    mpm_walls_apply(sim->walls, sim->n_walls, &sim->grid, gravity, dt);
     charge(sim, MPM_PHASE_GRID, &clock);
 
     // G2P, eqs. 11-17; with F-bar, eq. 19 (Algorithm 1, step 3) with it
@@ -466,26 +596,26 @@ static enum mpm_status step(struct mpm_sim *sim, struct mpm_error *err) {
                                       .a = now->fbar.a,
                                       .C = now->fbar.C,
                                       .keep = now->fbar.keep};
-        for_particles(sim, b, span, averaged, g2p, &found);
+        const struct particles_work work = {
+            .span = span, .work = g2p, .clears_sums = !any_fbar && b == 0};
+        for_particles(sim, b, work, averaged, &found);
     }
     charge(sim, MPM_PHASE_G2P, &clock);
 
     // F-bar, eqs. 20-27: Algorithm 1, steps 4 and 5
     if (any_fbar) {
-        mpm_walls_fold_fbar(sim->walls, sim->n_walls, &sim->grid);
         mpm_team_run(sim->team, divide_nodes, sim);
-        mpm_walls_mirror_fbar(sim->walls, sim->n_walls, &sim->grid);
         for (size_t b = 0; b < sim->n_sets; b++) {
             if (sim->sets[b].wants_fbar) {
-                const struct mpm_span span = {.fbar = true,
-                                              .scheme = scheme,
-                                              .C = now->fbar.C,
-                                              .keep = now->fbar.keep};
-                for_particles(sim, b, span, false, fbar, &found);
+                const struct mpm_span span = {
+                    .fbar = true, .scheme = scheme, .C = now->fbar.C, .keep = now->fbar.keep};
+                for_particles(sim, b, (struct particles_work){.span = span, .work = fbar}, false,
+                              &found);
             }
         }
         charge(sim, MPM_PHASE_FBAR, &clock);
     }
+    sim->grid.sums_are_clear = true;
 
     enum mpm_status status = check_result(sim, &found, time, err);
     if (!status && sim->n_rigids > 0) {

@@ -6,8 +6,10 @@
 #include <limits.h>
 #include <sched.h>
 #include <stddef.h>
+#include <stdlib.h>
 #ifdef __linux__
 #include <linux/futex.h>
+#include <linux/membarrier.h>
 #include <sys/syscall.h>
 #include <unistd.h>
 #endif
@@ -23,6 +25,21 @@ static void pause_a_moment(void) {
 #endif
 }
 
+// Who goes to sleep says so and then looks at the word again; who changes the word then looks
+// whether anyone sleeps. One of them sees the other only if neither's store waits behind its look.
+// Words change at every tile and sleep is rare, so the sleeper pays for both: the kernel has every
+// running thread of the process pass a barrier (membarrier(2)). Where it cannot, each pays its own.
+static void fence_all(const struct mpm_team *team) {
+    atomic_thread_fence(memory_order_seq_cst);
+#ifdef __linux__
+    if (!team->fences) {
+        syscall(SYS_membarrier, MEMBARRIER_CMD_PRIVATE_EXPEDITED, 0, 0);
+    }
+#else
+    (void)team;
+#endif
+}
+
 void mpm_team_await(struct mpm_team *team, atomic_uint *word, unsigned old) {
     for (int k = 0; k < LOOKS; k++) {
         if (atomic_load_explicit(word, memory_order_acquire) != old) {
@@ -30,9 +47,8 @@ void mpm_team_await(struct mpm_team *team, atomic_uint *word, unsigned old) {
         }
         pause_a_moment();
     }
-    // In this order, with mpm_team_tell() in the opposite one: either it sees a sleeper or we its
-    // change.
     atomic_fetch_add(&team->asleep, 1);
+    fence_all(team);
     while (atomic_load(word) == old) {
 #ifdef __linux__
         syscall(SYS_futex, word, FUTEX_WAIT_PRIVATE, old, NULL, NULL, 0);
@@ -45,7 +61,12 @@ void mpm_team_await(struct mpm_team *team, atomic_uint *word, unsigned old) {
 
 void mpm_team_tell(struct mpm_team *team, atomic_uint *word) {
 #ifdef __linux__
-    if (atomic_load(&team->asleep) > 0) {
+    if (team->fences) {
+        atomic_thread_fence(memory_order_seq_cst);
+    } else {
+        atomic_signal_fence(memory_order_seq_cst); // the compiler keeps the order
+    }
+    if (atomic_load_explicit(&team->asleep, memory_order_relaxed) > 0) {
         syscall(SYS_futex, word, FUTEX_WAKE_PRIVATE, INT_MAX, NULL, NULL, 0);
     }
 #else
@@ -54,8 +75,28 @@ void mpm_team_tell(struct mpm_team *team, atomic_uint *word) {
 #endif
 }
 
-void mpm_team_create(struct mpm_team *team, int n_threads) {
-    *team = (struct mpm_team){.n_threads = n_threads, .n_there = 1};
+struct mpm_team *mpm_team_create(int n_threads) {
+    const size_t seats = (size_t)n_threads * sizeof(struct mpm_seat);
+    struct mpm_team *team = aligned_alloc(64, sizeof *team);
+    struct mpm_seat *seat = aligned_alloc(64, seats);
+    if (!team || !seat) {
+        free(team);
+        free(seat);
+        return NULL;
+    }
+    *team = (struct mpm_team){.n_threads = n_threads, .n_there = 1, .seats = seat};
+#ifdef __linux__
+    team->fences =
+        n_threads > 1 && syscall(SYS_membarrier, MEMBARRIER_CMD_REGISTER_PRIVATE_EXPEDITED, 0, 0);
+#endif
+    return team;
+}
+
+void mpm_team_free(struct mpm_team *team) {
+    if (team) {
+        free(team->seats);
+        free(team);
+    }
 }
 
 void mpm_team_barrier(struct mpm_team *team, int there) {
@@ -68,8 +109,15 @@ void mpm_team_barrier(struct mpm_team *team, int there) {
         return;
     }
     atomic_store_explicit(&team->met, 0, memory_order_relaxed);
-    atomic_fetch_add(&team->meeting, 1);
+    atomic_store_explicit(&team->meeting, meeting + 1, memory_order_release);
     mpm_team_tell(team, &team->meeting);
+}
+
+static unsigned next_round(struct mpm_team *team) {
+    const unsigned round = atomic_load_explicit(&team->round, memory_order_relaxed) + 1;
+    atomic_store_explicit(&team->round, round, memory_order_release);
+    mpm_team_tell(team, &team->round);
+    return round;
 }
 
 static void serve(struct mpm_team *team, unsigned round, int own, int there) {
@@ -79,22 +127,20 @@ static void serve(struct mpm_team *team, unsigned round, int own, int there) {
             return;
         }
         team->work(team->context, own, there);
-        if (atomic_fetch_sub(&team->at_work, 1) == 1) {
-            mpm_team_tell(team, &team->at_work);
-        }
+        atomic_uint *done = &team->seats[own].done;
+        atomic_store_explicit(done, round, memory_order_release);
+        mpm_team_tell(team, done);
     }
-}
-
-static void next_round(struct mpm_team *team) {
-    atomic_fetch_add(&team->round, 1);
-    mpm_team_tell(team, &team->round);
 }
 
 void mpm_team_hold(struct mpm_team *team, void (*body)(void *context), void *context) {
 #ifdef _OPENMP
-    if (team->n_threads > 1) {
+    if (team->n_threads > 1 && !team->held) {
         const unsigned round = atomic_load(&team->round);
-        team->over = 0;
+        for (int k = 0; k < team->n_threads; k++) {
+            atomic_init(&team->seats[k].done, round);
+        }
+        team->over = false;
 #pragma omp parallel num_threads(team->n_threads)
         {
             const int own = omp_get_thread_num(), there = omp_get_num_threads();
@@ -102,9 +148,11 @@ void mpm_team_hold(struct mpm_team *team, void (*body)(void *context), void *con
                 serve(team, round, own, there);
             } else {
                 team->n_there = there;
+                team->held = true;
                 body(context);
+                team->held = false;
                 team->n_there = 1;
-                team->over = 1;
+                team->over = true;
                 next_round(team);
             }
         }
@@ -115,19 +163,19 @@ void mpm_team_hold(struct mpm_team *team, void (*body)(void *context), void *con
 }
 
 void mpm_team_run(struct mpm_team *team, mpm_team_work *work, void *context) {
-    if (team->n_there > 1) {
+    const int there = team->n_there;
+    if (there > 1) {
         team->work = work;
         team->context = context;
-        atomic_store_explicit(&team->at_work, (unsigned)team->n_there - 1, memory_order_relaxed);
-        next_round(team);
-        work(context, 0, team->n_there);
-        for (unsigned left; (left = atomic_load(&team->at_work)) > 0;) {
-            mpm_team_await(team, &team->at_work, left);
+        const unsigned round = next_round(team);
+        work(context, 0, there);
+        for (int k = 1; k < there; k++) {
+            mpm_team_await(team, &team->seats[k].done, round - 1);
         }
         return;
     }
 #ifdef _OPENMP
-    if (team->n_threads > 1) {
+    if (team->n_threads > 1 && !team->held) {
 #pragma omp parallel num_threads(team->n_threads)
         work(context, omp_get_thread_num(), omp_get_num_threads());
         return;

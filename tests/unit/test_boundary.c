@@ -469,6 +469,63 @@ static void test_boundary_far_wall_is_idle(void **state) {
     }
 }
 
+// Thrown into a corner of walls, across the cuts between the threads' parts: each sees to its own
+// columns, and what is common to them is in one order.
+static struct mpm_sim *thrown(int dim, int basis, int variant, int n_threads) {
+    define(dim, basis, variant % 2);
+    world.def.n_threads = n_threads;
+    world.def.cell = dim == 2 ? H / 4 : H / 2;
+    world.def.walls_hold_nodes = variant == 3;
+    for (int d = 0; d < 3; d++) {
+        world.bodies[0].shape.min[d] = 0.25;
+        world.bodies[0].shape.max[d] = d == 0 ? 0.75 : 0.5;
+        world.bodies[0].velocity.vector[d] = d == 1 ? -6 : -3;
+    }
+    add_wall(1, 0.25, true, (enum mpm_wall_condition)(variant % 3));
+    add_wall(0, 0.25, true, MPM_WALL_SLIP);
+    add_wall(0, 0.75, false, (enum mpm_wall_condition)((variant + 1) % 3));
+    add_wall(1, 0.5, false, MPM_WALL_SEPARATE);
+    if (dim == 3) {
+        add_wall(2, 0.25, true, MPM_WALL_FIXED);
+    }
+    if (variant != 2) {
+        world.def.n_probes = 0; // no reactions: they are sums, in one order
+    }
+    return create();
+}
+
+static void test_boundary_does_not_depend_on_threads(void **state) {
+    (void)state;
+    int n_common = 0, n_apart = 0;
+    for (int k = 0; k < 2 * MPM_N_BASES * 4; k++) {
+        const int dim = 2 + k % 2, basis = k / 2 % MPM_N_BASES, variant = k / 2 / MPM_N_BASES;
+        struct mpm_sim *one = thrown(dim, basis, variant, 1);
+        for (int s = 0; s < 25; s++) {
+            step(one);
+        }
+        const int n_threads[] = {2, 3, 5};
+        for (int q = 0; q < 3; q++) {
+            struct mpm_sim *sim = thrown(dim, basis, variant, n_threads[q]);
+            for (int s = 0; s < 25; s++) {
+                step(sim);
+            }
+            n_common += sim->walls_in_common;
+            n_apart += !sim->walls_in_common;
+            if (memcmp(sim->sets[0].memory, one->sets[0].memory, one->sets[0].memory_bytes) != 0) {
+                fail_msg("%dD, basis %d, variant %d: %d threads", dim, basis, variant,
+                         n_threads[q]);
+            }
+            for (size_t w = 0; w < sim->n_walls; w++) {
+                assert_memory_equal(sim->walls[w].reaction, one->walls[w].reaction,
+                                    sizeof one->walls[w].reaction);
+            }
+            mpm_free(sim);
+        }
+        mpm_free(one);
+    }
+    assert_true(n_common > 0 && n_apart > 0); // both ways were tried
+}
+
 int main(int argc, char **argv) {
     feenableexcept(FE_DIVBYZERO | FE_INVALID | FE_OVERFLOW);
     const struct CMUnitTest tests[] = {
@@ -482,6 +539,7 @@ int main(int argc, char **argv) {
         cmocka_unit_test(test_boundary_momentum_balances_in_corners),
         cmocka_unit_test(test_boundary_floor_carries_the_weight),
         cmocka_unit_test(test_boundary_far_wall_is_idle),
+        cmocka_unit_test(test_boundary_does_not_depend_on_threads),
     };
     cmocka_set_test_filter(argc > 1 ? argv[1] : NULL);
     return cmocka_run_group_tests(tests, NULL, NULL);

@@ -57,8 +57,8 @@ static void rounds(void *context) {
 static void test_team_does_each_part_once(void **state) {
     (void)state;
     for (int n = 1; n <= MOST; n += 3) {
-        struct mpm_team *team = aligned_alloc(64, sizeof *team);
-        mpm_team_create(team, n);
+        struct mpm_team *team = mpm_team_create(n);
+    assert_non_null(team);
         for (int held = 0; held < 2; held++) {
             struct count c = {.team = team};
             if (held) {
@@ -71,7 +71,7 @@ static void test_team_does_each_part_once(void **state) {
                 assert_int_equal(c.done[own], own < c.there ? ROUNDS : 0);
             }
         }
-        free(team);
+        mpm_team_free(team);
     }
 }
 
@@ -84,14 +84,14 @@ static void hold_again(void *context) {
 // A step after the other: what one leaves does not end or begin the next.
 static void test_team_can_be_held_again(void **state) {
     (void)state;
-    struct mpm_team *team = aligned_alloc(64, sizeof *team);
-    mpm_team_create(team, 3);
+    struct mpm_team *team = mpm_team_create(3);
+    assert_non_null(team);
     struct count c = {.team = team};
     for (int k = 0; k < ROUNDS; k++) {
         mpm_team_hold(team, hold_again, &c);
         assert_int_equal(c.done[0], k + 1);
     }
-    free(team);
+    mpm_team_free(team);
 }
 
 int main(int argc, char **argv) {
