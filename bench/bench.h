@@ -17,13 +17,17 @@ double wall_now(void); // s
 double median(const double *values, int n);
 // Seconds of a fused multiply-add of one double, in the widest vectors that the kernels use.
 double fma_seconds(void);
-// How much slower one thread becomes when another is at work, too: the machine's doing.
-double clock_loss(void);
 // Seconds per particle and step, of steps that take about `seconds`; NaN when one fails.
 double timed(struct mpm_sim *sim, double seconds);
-// Median of the rounds' ratios, one / other, and of one's ns per particle and step; of several
-// threads the ratio of their best rounds.
+// Medians of the rounds' ratios, one / other, by processor time, and of one's ns per particle and
+// step.
 double pair_of(struct mpm_sim *one, struct mpm_sim *other, double *ns);
+// The same of two threads, by the wall clock, against the mean of two simulations of one thread
+// each that run at the same time: what cores lose when both are at work (clock, cache, neighbours
+// in a virtual machine) is the machine's doing, and is in both.
+double threads_pair(struct mpm_sim *two, struct mpm_sim *const one[2], double *ns);
+// Seconds in which a cache line goes from core to core and back.
+double line_there_and_back(void);
 void verdict_row(const char *group, const char *what, double ns, double ratio, double most);
 
 // A row of the JSON.
@@ -34,4 +38,4 @@ void text(const char *key, const char *value);
 void close_row(void);
 
 void stages_of(struct mpm_sim *sim); // bench/stages.c: rows of its passes
-void scenes(void); // bench/scenes.c
+void scenes(void);                   // bench/scenes.c

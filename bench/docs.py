@@ -53,7 +53,7 @@ def main():
     calibration = of("calibration")
     print("# What `make bench` measured\n")
     print("Made by `make bench-docs` from the JSON of `make bench` (its groups one after another: `make bench-solver BENCH=kernels` and so on, and `make bench-recording`). "
-          "Every row is a median of rounds in which the things compared took turns (of two threads, on the wall clock: the best rounds); [design.md](design.md#the-kernels) says what the limits are. In brackets what was asked for, "
+          "Every row is a median of rounds in which the things compared took turns (two threads against the mean of two runs of one thread each at the same time, so that what cores lose when both are at work is in both); [design.md](design.md#the-kernels) says what the limits are. In brackets what was asked for, "
           "on the machine of the goals: ns on another machine, and so the share of the limit, are no verdict, the ratios are. Groups that were measured more than once have a row a time: machines that others share change by a factor of 1.5 from one minute to the next, and two threads feel it first.\n")  # fmt: skip
     if calibration:
         fma = sorted(r["multiply_add_ns"] for r in calibration)
@@ -96,7 +96,7 @@ def main():
             elif "hours" in r:
                 print(f"- {r['scene']}: {r['particles']:,.0f} particles, {r['threads']:.0f} thread(s): {r['ns_per_particle_step']:.1f} ns, so {r['hours']:.2f} h for the whole (asked for: 1.5 h on two).")
             elif r["group"] == "meeting":
-                print(f"- {r['scene']}: parallel work that does nothing takes two threads {r['us_a_piece']:.2f} µs a piece, six a step; a step on one thread {r['us_a_step_on_one_thread']:.0f} µs: two are at most {r['at_most_times_as_fast']:.2f} times as fast.")  # fmt: skip
+                print(f"- {r['scene']}: parallel work that does nothing takes two threads {r['us_a_piece']:.2f} µs a piece, {r['pieces']:.0f} a step; a step on one thread {r['us_a_step_on_one_thread']:.0f} µs: two are at most {r['at_most_times_as_fast']:.2f} times as fast. A cache line took {r['line_there_and_back_ns']:.0f} ns to the other core and back.")  # fmt: skip
         print()
         print(table(VERDICT_HEAD, map(verdict, (r for r in scenes if "what" in r))) + "\n")
 

@@ -20,7 +20,7 @@ static struct run open_scene(const char *name, const char *patch_text, int n_thr
     if (run.scene) {
         struct mpm_def *def = scene_def(run.scene);
         def->n_threads = n_threads;
-        def->clock = n_threads > 1 ? wall_now : now;
+        def->clock = wall_now;
         if (mpm_create(def, &run.sim, &err)) {
             printf("FAILED: %s: %s %s\n", name, err.pointer, err.message);
         }
@@ -52,23 +52,42 @@ static struct run continue_scene(const char *name, const char *patch, int n_thre
     return run;
 }
 
-// Of the particle-steps' rate, two states in turns: `at` least the ratio asked for.
-static void compare(const char *name, const char *patch, const char *what, void *const *state,
-                    const size_t *bytes, int one, int one_threads, int other, int other_threads,
-                    double at_most) {
-    struct run a = continue_scene(name, patch, one_threads, state[one], bytes[one]);
-    struct run b = continue_scene(name, patch, other_threads, state[other], bytes[other]);
+static void close_verdict(const char *name, const char *what, double ns, double ratio,
+                          double at_most, const struct mpm_sim *sim) {
+    char text_of[100];
+    snprintf(text_of, sizeof text_of, "%s: %s", name, what);
+    verdict_row("scenes", text_of, ns, ratio, at_most);
+    number("particles", (double)mpm_n_particles(sim));
+    close_row();
+}
+
+// Two states in turns, each on one thread.
+static void compare(const char *name, const char *patch, void *const *state, const size_t *bytes,
+                    int late, int early) {
+    struct run a = continue_scene(name, patch, 1, state[late], bytes[late]);
+    struct run b = continue_scene(name, patch, 1, state[early], bytes[early]);
     if (a.sim && b.sim) {
         double ns;
         const double ratio = pair_of(a.sim, b.sim, &ns);
-        char text_of[100];
-        snprintf(text_of, sizeof text_of, "%s: %s", name, what);
-        verdict_row("scenes", text_of, ns, ratio, at_most);
-        number("particles", (double)mpm_n_particles(a.sim));
-        close_row();
+        close_verdict(name, "ns in the last tenth / in the first", ns, ratio, 1 / 0.9, a.sim);
     }
     close_run(&a);
     close_run(&b);
+}
+
+// One state, by two threads and by one.
+static void share(const char *name, const char *patch, const void *state, size_t bytes) {
+    struct run two = continue_scene(name, patch, 2, state, bytes);
+    struct run one = continue_scene(name, patch, 1, state, bytes);
+    struct run other = continue_scene(name, patch, 1, state, bytes);
+    if (two.sim && one.sim && other.sim) {
+        double ns;
+        const double ratio = threads_pair(two.sim, (struct mpm_sim *[]){one.sim, other.sim}, &ns);
+        close_verdict(name, "spread out, two threads / one", ns, ratio, 1 / 1.7, two.sim);
+    }
+    close_run(&two);
+    close_run(&one);
+    close_run(&other);
 }
 
 // ---- What two threads need to meet ----
@@ -86,7 +105,9 @@ static void pieces(void *context) {
     }
 }
 
-// Parallel work begins and ends, with nothing in between: us. A step with F-bar has six pieces of it.
+#define A_STEP 5 // pieces of parallel work of a step with F-bar
+
+// Parallel work begins and ends, with nothing in between: us.
 static void meeting(const char *name, const char *patch, const void *state, size_t bytes) {
     struct run run = continue_scene(name, patch, 2, state, bytes);
     if (run.sim) {
@@ -101,14 +122,20 @@ static void meeting(const char *name, const char *patch, const void *state, size
         }
         close_run(&one);
         const double piece = median(us, rounds), whole = median(step, rounds);
-        printf("  a piece of parallel work that does nothing takes two threads %.2f us; six a step: %.1f us, "
-               "a step on one thread %.1f us: so at most %.2f times as fast\n",
-               piece, 6 * piece, whole, whole / (whole / 2 + 6 * piece));
+        const double line = 1e9 * line_there_and_back();
+        printf("  a piece of parallel work that does nothing takes two threads %.2f us; %d a step: "
+               "%.1f us, "
+               "a step on one thread %.1f us: so at most %.2f times as fast; a cache line takes "
+               "%.0f ns "
+               "to the other core and back\n",
+               piece, A_STEP, A_STEP * piece, whole, whole / (whole / 2 + A_STEP * piece), line);
         open_row("meeting");
         text("scene", name);
         number("us_a_piece", piece);
+        number("pieces", A_STEP);
         number("us_a_step_on_one_thread", whole);
-        number("at_most_times_as_fast", whole / (whole / 2 + 6 * piece));
+        number("at_most_times_as_fast", whole / (whole / 2 + A_STEP * piece));
+        number("line_there_and_back_ns", line);
         close_row();
     }
     close_run(&run);
@@ -125,7 +152,7 @@ static void whole_scene(const char *name, const char *patch, double spread) {
     const double moments[MOMENTS] = {first + 0.05 * all, spread, first + 0.95 * all};
     void *state[MOMENTS] = {0};
     size_t bytes[MOMENTS] = {0}, n = mpm_n_particles(run.sim);
-    double rate[10], since = now(), begin = since;
+    double rate[10], since = now(), begin = since, wall = wall_now();
     uint64_t steps = 0;
     int tenth = 0, moment = 0;
     struct mpm_error err = {0};
@@ -148,9 +175,11 @@ static void whole_scene(const char *name, const char *patch, double spread) {
         }
     }
     const double all_s = now() - begin;
+    wall = wall_now() - wall;
     steps = mpm_step_count(run.sim);
-    printf("%s: %zu particles, %llu steps in %.1f s of one thread, %.1f M particle-steps/s; by tenths",
-           name, n, (unsigned long long)steps, all_s, 1e-6 * (double)steps * (double)n / all_s);
+    printf(
+        "%s: %zu particles, %llu steps in %.1f s of one thread, %.1f M particle-steps/s; by tenths",
+        name, n, (unsigned long long)steps, all_s, 1e-6 * (double)steps * (double)n / all_s);
     open_row("scenes");
     text("scene", name);
     number("particles", (double)n);
@@ -165,21 +194,19 @@ static void whole_scene(const char *name, const char *patch, double spread) {
     printf("\n  phases, %% of all:");
     double sum = 0;
     for (int k = 0; k < MPM_N_PHASES; k++) {
-        const double share = 100 * mpm_phase_seconds(run.sim, (enum mpm_phase)k) / all_s;
-        printf(" %s %.1f", mpm_phase_name((enum mpm_phase)k), share);
-        number(mpm_phase_name((enum mpm_phase)k), share);
-        sum += share;
+        const double part = 100 * mpm_phase_seconds(run.sim, (enum mpm_phase)k) / wall;
+        printf(" %s %.1f", mpm_phase_name((enum mpm_phase)k), part);
+        number(mpm_phase_name((enum mpm_phase)k), part);
+        sum += part;
     }
     printf(", together %.1f\n", sum);
     number("all_phases", sum);
     close_row();
     close_run(&run);
     if (moment == MOMENTS) {
-        compare(name, patch, "ns in the last tenth / in the first", state, bytes, 2, 1, 0, 1, 1 / 0.9);
-        const double loss = clock_loss();
-        printf("  both cores at work, multiply-adds take %.2f of their time alone\n", loss);
+        compare(name, patch, state, bytes, 2, 0);
         meeting(name, patch, state[1], bytes[1]);
-        compare(name, patch, "spread out, two threads / one", state, bytes, 1, 2, 1, 1, loss / 1.7);
+        share(name, patch, state[1], bytes[1]);
     }
     for (int k = 0; k < MOMENTS; k++) {
         free(state[k]);
@@ -194,7 +221,8 @@ static void landslide(void) {
         if (run.sim) {
             const double n = (double)mpm_n_particles(run.sim);
             timed(run.sim, 0.3);
-            const double ns = 1e9 * timed(run.sim, quick ? 0.3 : 3), hours = 1e-9 * ns * n * steps / 3600;
+            const double ns = 1e9 * timed(run.sim, quick ? 0.3 : 3),
+                         hours = 1e-9 * ns * n * steps / 3600;
             printf("landslide: %.0f particles, %d thread%s: %.1f ns, %.1f M particle-steps/s: the "
                    "whole of %.0f steps in %.2f h (asked for: 1.5 h on two)\n",
                    n, threads, threads > 1 ? "s" : "", ns, 1e3 / ns, steps, hours);

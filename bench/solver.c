@@ -10,6 +10,7 @@
 //
 // bench-solver [--quick] [--json FILE] [FILTER]: only groups whose name contains FILTER.
 #include <math.h>
+#include <omp.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -48,8 +49,12 @@ double wall_now(void) {
 // Variables of their own, not an array: that the compiler might keep in memory.
 #define EACH_12(X) X(a) X(b) X(c) X(d) X(e) X(f) X(g) X(h) X(i) X(j) X(k) X(l)
 #define DECLARE(a) a = y,
-#define MULTIPLY_ADD_512(a) a = _mm512_fmadd_pd(a, x, y); __asm__ volatile("" : "+v"(a));
-#define MULTIPLY_ADD_256(a) a = _mm256_fmadd_pd(a, x, y); __asm__ volatile("" : "+x"(a));
+#define MULTIPLY_ADD_512(a)                                                                        \
+    a = _mm512_fmadd_pd(a, x, y);                                                                  \
+    __asm__ volatile("" : "+v"(a));
+#define MULTIPLY_ADD_256(a)                                                                        \
+    a = _mm256_fmadd_pd(a, x, y);                                                                  \
+    __asm__ volatile("" : "+x"(a));
 __attribute__((target("avx512f"))) static double fma_512(long n) {
     const __m512d x = _mm512_set1_pd(0.9999999), y = _mm512_set1_pd(1e-9);
     __m512d EACH_12(DECLARE) last;
@@ -110,13 +115,13 @@ struct block {
     enum mpm_isa isa;
     double room; // cells of domain beyond the block on every side
     // What a scene may have and not use:
-    int n_probes;           // declared, none of them asked for
-    bool fbar_once;         // F-bar was on in the first step
-    bool fbar_excepted;     // F-bar is on, but the material is excepted
-    bool material_besides;  // a plastic material that no body has
-    bool contact_over;      // a rigid body that the first stage removed
-    bool load_over;         // a load that the first stage removed
-    bool rigid_far;         // a rigid body out of reach: looked at, block by block
+    int n_probes;          // declared, none of them asked for
+    bool fbar_once;        // F-bar was on in the first step
+    bool fbar_excepted;    // F-bar is on, but the material is excepted
+    bool material_besides; // a plastic material that no body has
+    bool contact_over;     // a rigid body that the first stage removed
+    bool load_over;        // a load that the first stage removed
+    bool rigid_far;        // a rigid body out of reach: looked at, block by block
 };
 
 static struct world {
@@ -127,7 +132,7 @@ static struct world {
     struct mpm_probe_def probes[8];
     struct mpm_rigid_def rigid;
     struct mpm_load_def load;
-} worlds[2];
+} worlds[3];
 static const bool yes = true;
 
 // A free block in its second free mode along x, v ~ cos(2 pi s/L): it stays where it is, strains
@@ -218,8 +223,8 @@ static struct mpm_sim *create(int which, struct block b) {
     return sim;
 }
 
-// Seconds per particle and step, of steps that take about the time given. A case that fails says so,
-// and gives NaN; the others go on.
+// Seconds per particle and step, of steps that take about the time given. A case that fails says
+// so, and gives NaN; the others go on.
 static double timed_by(double (*clock)(void), struct mpm_sim *sim, double seconds) {
     struct mpm_error err = {0};
     const double n = (double)mpm_n_particles(sim), t = clock();
@@ -345,10 +350,10 @@ static void kernel_row(const char *group, struct block b, struct goal goal) {
     const struct limit limit = limit_of(b);
     const double through_memory =
         (double)mpm_bytes(fast) < 8e6 ? 0 : limit.bytes * least(memory, rounds);
-    const double share = mpm_support(b.basis) == 3
-                             ? fmax(limit.flops * least(fma, rounds), through_memory) /
-                                   median(ns, rounds)
-                             : NAN;
+    const double share =
+        mpm_support(b.basis) == 3
+            ? fmax(limit.flops * least(fma, rounds), through_memory) / median(ns, rounds)
+            : NAN;
     char percent[16] = "  -";
     if (isfinite(share)) {
         snprintf(percent, sizeof percent, "%3.0f %%", 100 * share);
@@ -409,10 +414,10 @@ static void kernels(void) {
         double n;
         struct goal goal[2];
     } cases[] = {
-        {2, 2, 1e4, {{6, 18, 6.2}, {5.3, 27, 8.2}}},   {2, 2, 1e5, {{6, 0, 0}, {5.3, 0, 0}}},
-        {2, 2, 1e6, {{6, 23, 7.7}, {5.3, 36, 17}}},    {2, 4, 1e4, {{7.5, 13, 6.2}, {7, 20, 8.2}}},
-        {2, 4, 1e5, {{7.5, 0, 0}, {7, 0, 0}}},         {2, 4, 1e6, {{7.5, 0, 0}, {7, 0, 0}}},
-        {3, 2, 1e5, {{6, 57, 25}, {6, 78, 30}}},       {3, 2, 1e6, {{6, 60, 25}, {6, 84, 30}}}};
+        {2, 2, 1e4, {{6, 18, 6.2}, {5.3, 27, 8.2}}}, {2, 2, 1e5, {{6, 0, 0}, {5.3, 0, 0}}},
+        {2, 2, 1e6, {{6, 23, 7.7}, {5.3, 36, 17}}},  {2, 4, 1e4, {{7.5, 13, 6.2}, {7, 20, 8.2}}},
+        {2, 4, 1e5, {{7.5, 0, 0}, {7, 0, 0}}},       {2, 4, 1e6, {{7.5, 0, 0}, {7, 0, 0}}},
+        {3, 2, 1e5, {{6, 57, 25}, {6, 78, 30}}},     {3, 2, 1e6, {{6, 60, 25}, {6, 84, 30}}}};
     for (size_t k = 0; k < sizeof cases / sizeof *cases; k++) {
         for (int scheme = 0; scheme < MPM_N_FBAR_SCHEMES; scheme++) {
             if (quick && cases[k].n > 1e5) {
@@ -457,10 +462,12 @@ static void stages(void) {
         return;
     }
     for (int k = 0; k < 4; k++) {
-        struct block b = block_of(2 + k / 2, 2, k < 2 ? 1e4 : 1e5, k % 2 ? MPM_FBAR_ZHAO : MPM_FBAR_OFF);
+        struct block b =
+            block_of(2 + k / 2, 2, k < 2 ? 1e4 : 1e5, k % 2 ? MPM_FBAR_ZHAO : MPM_FBAR_OFF);
         struct mpm_sim *sim = create(0, b);
-        printf("\nStages of the passes, %dD, B-spline, F-bar %s: ns a particle, each what it adds\n",
-               b.dim, mpm_fbar_name(b.scheme));
+        printf(
+            "\nStages of the passes, %dD, B-spline, F-bar %s: ns a particle, each what it adds\n",
+            b.dim, mpm_fbar_name(b.scheme));
         if (sim) {
             stages_of(sim);
         }
@@ -473,9 +480,8 @@ static void stages(void) {
 double pair_of(struct mpm_sim *one, struct mpm_sim *other, double *ns) {
     const int rounds = quick ? 5 : 15;
     const double turn = quick ? 0.02 : 0.05;
-    double ratio[MAX_ROUNDS], first[MAX_ROUNDS], second[MAX_ROUNDS];
-    const bool wall = one->def->n_threads > 1 || other->def->n_threads > 1;
-    double (*const clock)(void) = wall ? wall_now : now;
+    double ratio[MAX_ROUNDS], first[MAX_ROUNDS];
+    double (*const clock)(void) = now;
     timed(one, turn);
     timed(other, turn);
     for (int r = 0; r < rounds; r++) { // who begins takes turns, too
@@ -489,12 +495,56 @@ double pair_of(struct mpm_sim *one, struct mpm_sim *other, double *ns) {
         }
         ratio[r] = x / y;
         first[r] = 1e9 * x;
-        second[r] = 1e9 * y;
     }
-    // On the wall clock what others take counts, and two threads wait for the one that they take it
-    // from: so the best rounds are compared.
-    *ns = wall ? least(first, rounds) : median(first, rounds);
-    return wall ? least(first, rounds) / least(second, rounds) : median(ratio, rounds);
+    *ns = median(first, rounds);
+    return median(ratio, rounds);
+}
+
+double threads_pair(struct mpm_sim *two, struct mpm_sim *const one[2], double *ns) {
+    const int rounds = quick ? 5 : MAX_ROUNDS;
+    const double turn = quick ? 0.02 : 0.05;
+    double ratio[MAX_ROUNDS], shared[MAX_ROUNDS];
+    timed_by(wall_now, two, turn);
+    for (int r = 0; r < rounds; r++) {
+        double apart[2] = {0};
+        const double x = timed_by(wall_now, two, turn);
+#pragma omp parallel for num_threads(2) schedule(static, 1)
+        for (int k = 0; k < 2; k++) {
+            apart[k] = timed_by(wall_now, one[k], turn);
+        }
+        shared[r] = 1e9 * x;
+        ratio[r] = x / (0.5 * (apart[0] + apart[1]));
+    }
+    *ns = median(shared, rounds);
+    return median(ratio, rounds);
+}
+
+#define CALLS 20000
+
+double line_there_and_back(void) {
+    static struct { _Alignas(64) atomic_uint word; } to[2];
+    double seconds = NAN;
+    atomic_store(&to[0].word, 0);
+    atomic_store(&to[1].word, 0);
+#pragma omp parallel num_threads(2)
+    {
+        const int own = omp_get_thread_num();
+        const double t = wall_now();
+        for (unsigned k = 1; omp_get_num_threads() == 2 && k <= CALLS; k++) {
+            if (own == 0) {
+                atomic_store_explicit(&to[1].word, k, memory_order_release);
+            }
+            while (atomic_load_explicit(&to[own].word, memory_order_acquire) != k) {
+            }
+            if (own == 1) {
+                atomic_store_explicit(&to[0].word, k, memory_order_release);
+            }
+        }
+        if (own == 0 && omp_get_num_threads() == 2) {
+            seconds = (wall_now() - t) / CALLS;
+        }
+    }
+    return seconds;
 }
 
 void verdict_row(const char *group, const char *what, double ns, double ratio, double most) {
@@ -522,22 +572,6 @@ static void pair_row(const char *group, const char *what, struct block one, stru
     }
     mpm_free(a);
     mpm_free(b);
-}
-
-// How much slower one thread becomes when another is at work, too: the machine's doing.
-double clock_loss(void) {
-    double loss[MAX_ROUNDS];
-    const int rounds = quick ? 5 : 15;
-    for (int r = 0; r < rounds; r++) {
-        double together[2] = {0};
-        const double alone = fma_seconds();
-#pragma omp parallel for num_threads(2)
-        for (int k = 0; k < 2; k++) {
-            together[k] = fma_seconds();
-        }
-        loss[r] = fmax(together[0], together[1]) / alone;
-    }
-    return fmax(median(loss, rounds), 1); // below it is noise
 }
 
 static void ratios(void) {
@@ -582,18 +616,25 @@ static void threads(void) {
     if (!wanted("threads")) {
         return;
     }
-    const double loss = clock_loss();
-    printf("\nTwo threads against one: both at work, multiply-adds take %.2f of their time alone; "
-           "the goal "
-           "is for the ratio over that\n",
-           loss);
+    puts("\nTwo threads against one, both cores at work");
     for (int dim = 2; dim <= 3; dim++) {
-        const struct block other = block_of(dim, 2, 1e5, MPM_FBAR_ZHAO);
-        struct block one = other;
-        one.n_threads = 2;
-        pair_row("threads",
-                 dim == 2 ? "two threads / one, 2D, 100k" : "two threads / one, 3D, 100k", one,
-                 other, 0.55 * loss);
+        const struct block alone = block_of(dim, 2, 1e5, MPM_FBAR_ZHAO);
+        struct block shared = alone;
+        shared.n_threads = 2;
+        struct mpm_sim *two = create(0, shared), *one[2] = {create(1, alone), create(2, alone)};
+        if (two && one[0] && one[1]) {
+            double ns;
+            const double ratio = threads_pair(two, one, &ns);
+            verdict_row("threads",
+                        dim == 2 ? "two threads / one, 2D, 100k" : "two threads / one, 3D, 100k",
+                        ns, ratio, 0.55);
+            describe(shared, mpm_n_particles(two));
+            number("line_there_and_back_ns", 1e9 * line_there_and_back());
+            close_row();
+        }
+        mpm_free(two);
+        mpm_free(one[0]);
+        mpm_free(one[1]);
     }
 }
 
@@ -723,10 +764,8 @@ int main(int argc, char **argv) {
         } else if (strcmp(argv[k], "--json") == 0 && k + 1 < argc) {
             path = argv[++k];
         } else if (argv[k][0] == '-') {
-            fprintf(
-                stderr,
-                "usage: bench-solver [--quick] [--json FILE] [GROUP]\n"
-                "groups: kernels stages ratios threads features sort growth scenes\n");
+            fprintf(stderr, "usage: bench-solver [--quick] [--json FILE] [GROUP]\n"
+                            "groups: kernels stages ratios threads features sort growth scenes\n");
             return 2;
         } else {
             filter = argv[k];
@@ -738,7 +777,8 @@ int main(int argc, char **argv) {
         return 1;
     }
     fprintf(json, "[");
-    printf("calibration: %.3f ns for a multiply-add of the widest vectors, %.1f GB/s updated in place\n",
+    printf("calibration: %.3f ns for a multiply-add of the widest vectors, %.1f GB/s updated in "
+           "place\n",
            1e9 * fma_seconds() * (mpm_isa_available(MPM_ISA_AVX512) ? 8 : 4),
            1e-9 / memory_seconds());
     open_row("calibration");
@@ -755,7 +795,8 @@ int main(int argc, char **argv) {
     scenes();
     fprintf(json, "\n]\n");
     if (n_failed > 0) {
-        printf("\n%d cases FAILED: their rows are missing or of what was measured before\n", n_failed);
+        printf("\n%d cases FAILED: their rows are missing or of what was measured before\n",
+               n_failed);
     }
     return fclose(json) || n_failed > 0;
 }
