@@ -78,6 +78,7 @@ struct http_server {
     struct http_service service;
     char *cert, *key;
     int listener; // closed by quiescing
+    bool cuts_at_zeroes;
     pthread_mutex_t lock;
     struct peer *peers;
     struct http_counts counts; // most, most_of_address: fixed from the start on
@@ -166,27 +167,45 @@ bool http_decode(char *text) {
     return true;
 }
 
+// Decodes n bytes of a query, of which + is a blank, into `out`; false on a bad escape or where
+// they do not fit: then it is empty.
+static bool decode_piece(const char *from, size_t n, char *out, size_t bytes) {
+    out[0] = '\0';
+    if (n >= bytes)
+        return false;
+    memcpy(out, from, n);
+    out[n] = '\0';
+    for (char *c = out; *c != '\0'; c++)
+        if (*c == '+')
+            *c = ' ';
+    if (http_decode(out))
+        return true;
+    out[0] = '\0';
+    return false;
+}
+
+bool http_query_next(const struct http_request *q, size_t *at, char *key, size_t key_bytes,
+                     char *value, size_t value_bytes, bool *sound) {
+    const char *text = q->query != NULL ? q->query + *at : "";
+    size_t skip = strspn(text, "&"), n = strcspn(text + skip, "&"), length;
+    if (n == 0)
+        return false;
+    text += skip;
+    length = strcspn(text, "=&");
+    *at += skip + n;
+    *sound = decode_piece(text, length, key, key_bytes);
+    length += length < n; // the =
+    if (value != NULL && !decode_piece(text + length, n - length, value, value_bytes))
+        *sound = false;
+    return true;
+}
+
 bool http_query(const struct http_request *q, const char *key, char *out, size_t bytes) {
-    size_t length = strlen(key);
-    for (const char *at = q->query; at != NULL && *at != '\0';) {
-        const char *end = strchr(at, '&');
-        size_t n = end != NULL ? (size_t)(end - at) : strlen(at);
-        if (n >= length && strncmp(at, key, length) == 0 && (n == length || at[length] == '=')) {
-            size_t skip = n == length ? n : length + 1;
-            out[0] = '\0';
-            if (n - skip >= bytes)
-                return true;
-            memcpy(out, at + skip, n - skip);
-            out[n - skip] = '\0';
-            for (char *c = out; *c != '\0'; c++)
-                if (*c == '+')
-                    *c = ' ';
-            if (!http_decode(out))
-                out[0] = '\0';
+    char name[64];
+    bool sound;
+    for (size_t at = 0; http_query_next(q, &at, name, sizeof name, out, bytes, &sound);)
+        if (strcmp(name, key) == 0)
             return true;
-        }
-        at = end != NULL ? end + 1 : NULL;
-    }
     return false;
 }
 
@@ -357,7 +376,7 @@ static void produce_end(void *cls) {
     free(own);
 }
 
-static struct MHD_Response *make_response(struct http_reply *reply, int socket) {
+static struct MHD_Response *make_response(struct http_reply *reply, int socket, bool head_only) {
     struct MHD_Response *response = NULL;
     if (reply->produce != NULL) {
         struct endless *own = malloc(sizeof *own);
@@ -370,6 +389,9 @@ static struct MHD_Response *make_response(struct http_reply *reply, int socket) 
             free(own);
         else
             reply->close = NULL;
+        // libmicrohttpd sends the last chunk even where there is no body to be sent.
+        if (response != NULL && head_only)
+            MHD_set_response_options(response, MHD_RF_HTTP_1_0_COMPATIBLE_STRICT, MHD_RO_END);
     } else if (reply->fd >= 0) {
         response = MHD_create_response_from_fd_at_offset64(reply->bytes, reply->fd, reply->offset);
         if (response != NULL)
@@ -389,7 +411,8 @@ static struct MHD_Response *make_response(struct http_reply *reply, int socket) 
 static enum MHD_Result send_reply(struct http_request *q) {
     struct http_reply *reply = &q->reply;
     bool endless = reply->produce != NULL;
-    struct MHD_Response *response = make_response(reply, q->peer->socket);
+    struct MHD_Response *response =
+        make_response(reply, q->peer->socket, strcmp(q->method, "HEAD") == 0);
     if (response == NULL)
         return MHD_NO;
     if (endless || q->peer->refused || q->closes)
@@ -436,6 +459,9 @@ static void target_split(struct http_request *q) {
         q->path = root;
 }
 
+// By this thread's connection, from the request's first line on.
+static _Thread_local struct http_request *being_read;
+
 // The first that libmicrohttpd tells of a request: its target as it was sent, before any decoding.
 static void *on_target(void *cls, const char *target, struct MHD_Connection *connection) {
     struct http_server *server = cls;
@@ -454,6 +480,7 @@ static void *on_target(void *cls, const char *target, struct MHD_Connection *con
     q->target_bytes = strlen(target);
     if (q->target != NULL)
         target_split(q);
+    being_read = q;
     return q;
 }
 
@@ -465,6 +492,7 @@ static void on_completed(void *cls, struct MHD_Connection *connection, void **re
     (void)code;
     if (q == NULL)
         return;
+    being_read = NULL;
     peer_enter(q->server, q->peer, PEER_QUIET);
     reply_clear(&q->reply);
     free(q->target);
@@ -494,13 +522,58 @@ struct head {
     unsigned counts[SINGLES];
     size_t bytes;
     const char *fault; // what is wrong with it
+    const char *end;   // of its bytes as they were received, or NULL: they are not looked at
+    const char *told;  // of what was told of them so far
 };
+
+// Before 1.0 libmicrohttpd cuts lines at a zero byte and does not say so: `Host: localhost\0evil`
+// would be a request for localhost, where a proxy in front may see another. There the pieces of a
+// head lie where they were received, between them what it puts in the place of ':', CR and LF:
+// whatever else lies there was cut off. It does so too where a line goes on in the next (RFC
+// 9112, 5.2: 400).
+static bool cuts_at_zeroes(void) {
+    return strncmp(MHD_get_version(), "0.9.", 4) == 0;
+}
+
+// What lies between the last piece and this one: at most `zeroes`, and blanks.
+static void look_between(struct head *head, const char *to, unsigned zeroes) {
+    unsigned found = 0;
+    if (head->end == NULL || to < head->told || to > head->end)
+        return;
+    for (const char *c = head->told; c < to; c++) {
+        found += *c == '\0';
+        if ((*c != '\0' && *c != ' ' && *c != '\t') || found > zeroes)
+            head->fault = "the head has a zero byte, or a line that goes on in the next";
+    }
+    head->told = to;
+}
+
+// Method, target and version, with a blank between them.
+static void look_at_first_line(struct head *head, const struct http_request *q,
+                               const char *version) {
+    size_t method = strlen(q->method);
+    const union MHD_ConnectionInfo *info =
+        MHD_get_connection_info(q->connection, MHD_CONNECTION_INFO_REQUEST_HEADER_SIZE);
+    if (!q->server->cuts_at_zeroes || info == NULL || info->header_size > CONNECTION_MEMORY ||
+        version <= q->method || (size_t)(version - q->method) > info->header_size)
+        return;
+    head->end = q->method + info->header_size;
+    head->told = version + strlen(version);
+    if ((size_t)(version - q->method) != method + 1 + q->target_bytes + 1)
+        head->fault = "the request line has a zero byte, or more than one blank in a row";
+}
 
 static enum MHD_Result head_line(void *cls, enum MHD_ValueKind kind, const char *key,
                                  size_t key_bytes, const char *value, size_t value_bytes) {
     struct head *head = cls;
     (void)kind;
-    (void)value;
+    look_between(head, key, 2);
+    if (value != NULL && head->end != NULL && value >= head->told && value < head->end) {
+        if (key >= head->told && key <= value) // else the name was moved, for what came behind
+            head->told = key + key_bytes;
+        look_between(head, value, 1);
+        head->told = value + value_bytes;
+    }
     head->bytes += key_bytes + value_bytes + 4; // ": ", CRLF
     if (key == NULL || key_bytes == 0 || strcspn(key, " \t") != key_bytes)
         head->fault = "a header's name is empty or has a blank in it";
@@ -515,7 +588,9 @@ static bool head_sound(struct http_request *q, const char *version) {
     char why[128];
     const char *coding = http_header(q, "Transfer-Encoding"),
                *length = http_header(q, "Content-Length");
+    look_at_first_line(&head, q, version);
     MHD_get_connection_values_n(q->connection, MHD_HEADER_KIND, head_line, &head);
+    look_between(&head, head.end, 4);
     head.bytes += strlen(q->method) + strlen(version) + 4 + q->target_bytes;
     for (size_t k = 0; k < SINGLES && head.fault == NULL; k++)
         if (head.counts[k] > 1) {
@@ -612,11 +687,57 @@ static enum MHD_Result on_request(void *cls, struct MHD_Connection *connection, 
 
 // ---- Server -----------------------------------------------------------------------------------
 
+static void send_all(int socket, const char *text, size_t n) {
+    while (n > 0) {
+        ssize_t sent = send(socket, text, n, MSG_NOSIGNAL);
+        if (sent <= 0)
+            return;
+        text += sent;
+        n -= (size_t)sent;
+    }
+}
+
+// libmicrohttpd answers some heads and bodies by itself before it asks us, in HTML, and a bad
+// Content-Length twice over (before 1.0 parse_connection_headers goes on behind its own reply). It
+// says so in its log first, on the connection's own thread, before it has sent anything: the answer
+// is sent here, and what it sends afterwards is not let out. Not through TLS, whose session is its
+// own.
+static void answer_first(unsigned status) {
+    struct http_request *q = being_read;
+    char head[512];
+    struct http_reply reply = {.fd = -1};
+    if (q == NULL || q->replied || q->server->cert != NULL)
+        return;
+    q->replied = true;
+    q->service->malformed(q->service->context, (int)status,
+                          status == 413 ? "the length of the body is too large a number"
+                          : status == 431
+                              ? "the head of the request is too long"
+                              : "this is no request of HTTP/1.1, or its Content-Length or "
+                                "chunks are malformed",
+                          &reply);
+    int n = snprintf(head, sizeof head,
+                     "HTTP/1.1 %u %s\r\nContent-Type: %s\r\nCache-Control: no-store\r\n"
+                     "X-Content-Type-Options: nosniff\r\nConnection: close\r\n"
+                     "Content-Length: %zu\r\n\r\n",
+                     status, MHD_get_reason_phrase_for(status), reply.type, reply.bytes);
+    send_all(q->peer->socket, head, (size_t)n);
+    send_all(q->peer->socket, reply.body != NULL ? reply.body : "", reply.bytes);
+    shutdown(q->peer->socket, SHUT_WR);
+    reply_clear(&reply);
+}
+
 static void on_log(void *cls, const char *format, va_list arguments) {
+    static const char own_error[] = "Error processing request (HTTP response code is %u";
     char text[512];
+    va_list again;
     (void)cls;
+    va_copy(again, arguments);
     vsnprintf(text, sizeof text, format, arguments);
     log_line(LOG_LEVEL_DEBUG, "http", "%s", text);
+    if (strncmp(format, own_error, sizeof own_error - 1) == 0)
+        answer_first(va_arg(again, unsigned));
+    va_end(again);
 }
 
 static int listen_on(const struct http_address *address, bool tls, char *url, size_t url_bytes,
@@ -690,6 +811,7 @@ struct http_server *http_start(const struct http_address *address,
         return NULL;
     server->service = *service;
     server->listener = -1;
+    server->cuts_at_zeroes = cuts_at_zeroes();
     set_limits(&server->counts);
     pthread_mutex_init(&server->lock, NULL);
     if (tls && ((server->cert = file_text(address->tls_cert, false, why, why_bytes)) == NULL ||

@@ -20,6 +20,10 @@ const char *http_host(const struct http_request *request);
 // A query parameter, decoded into `out`; false when it is not there. One that does not fit, or
 // whose escapes are wrong, reads as empty.
 bool http_query(const struct http_request *request, const char *key, char *out, size_t bytes);
+// The parameters one by one, decoded, from *at on (begin with 0); false at the end. `sound` is
+// false where one does not fit or its escapes are wrong; `value` may be NULL.
+bool http_query_next(const struct http_request *request, size_t *at, char *key, size_t key_bytes,
+                     char *value, size_t value_bytes, bool *sound);
 const char *http_body(const struct http_request *request, size_t *bytes); // terminated
 // Decodes %XX in place; false on a bad escape or a zero byte.
 bool http_decode(char *text);

@@ -126,22 +126,23 @@ struct path {
     char segments[SEGMENTS_MAX][ROUTES_SEGMENT]; // decoded
 };
 
-static bool path_split(const char *text, struct path *out) {
+// 0, or the status of what is wrong.
+static int path_split(const char *text, struct path *out) {
     out->count = 0;
     if (*text != '/')
-        return false;
+        return 404;
     for (text++;; text++) {
         size_t n = strcspn(text, "/");
         if (out->count == SEGMENTS_MAX || n >= ROUTES_SEGMENT)
-            return false;
+            return 404;
         char *segment = out->segments[out->count++];
         memcpy(segment, text, n);
         segment[n] = '\0';
         if (!http_decode(segment))
-            return false;
+            return 400;
         text += n;
         if (*text == '\0')
-            return true;
+            return 0;
     }
 }
 
@@ -186,8 +187,11 @@ static bool route(struct call *c) {
     char allow[64] = "";
     const char *method = http_method(c->request);
     bool head = strcmp(method, "HEAD") == 0;
-    if (!path_split(http_path(c->request), &path)) {
-        reply_problem(c->reply, 404, NULL, "there is nothing at this path");
+    int wrong = path_split(http_path(c->request), &path);
+    if (wrong != 0) {
+        reply_problem(c->reply, wrong, NULL,
+                      wrong == 404 ? "there is nothing at this path"
+                                   : "the path has a %% without two hexadecimal digits, or %%00");
         return false;
     }
     for (size_t k = 0; k < routes_count; k++) {
@@ -211,6 +215,56 @@ static bool route(struct call *c) {
     return false;
 }
 
+// The names of the query parameters that a route knows, one after the other: "" at the end.
+static void next_parameter(const char **at, char *name, size_t bytes) {
+    name[0] = '\0';
+    while (*at != NULL && name[0] == '\0') {
+        const char *line = *at, *colon = strstr(line, ": "), *end = strchr(line, '\n');
+        if (strncmp(line, "header ", 7) != 0 && colon != NULL)
+            snprintf(name, bytes, "%.*s", (int)(colon - line), line);
+        *at = end != NULL ? end + 1 : NULL;
+    }
+}
+
+// Whether the query has nothing but parameters that the route declares, each once. Else the reply
+// is a 400.
+static bool query_known(struct call *c) {
+    char key[64], name[64], list[128] = "";
+    bool sound = true, twice = false, known = true;
+    unsigned seen = 0;
+    for (size_t at = 0; sound && known && !twice &&
+                        http_query_next(c->request, &at, key, sizeof key, NULL, 0, &sound);) {
+        const char *line = c->route->parameters;
+        unsigned bit = 1;
+        known = false;
+        for (next_parameter(&line, name, sizeof name); name[0] != '\0' && !known; bit <<= 1) {
+            known = strcmp(name, key) == 0;
+            twice = known && (seen & bit) != 0;
+            seen |= known ? bit : 0;
+            next_parameter(&line, name, sizeof name);
+        }
+    }
+    if (sound && known && !twice)
+        return true;
+    const char *line = c->route->parameters;
+    for (next_parameter(&line, name, sizeof name); name[0] != '\0';
+         next_parameter(&line, name, sizeof name)) {
+        size_t n = strlen(list);
+        snprintf(list + n, sizeof list - n, "%s%s", n > 0 ? ", " : "", name);
+    }
+    if (twice)
+        reply_problem(c->reply, 400, NULL, "the query has %.40s twice", key);
+    else if (!sound)
+        reply_problem(
+            c->reply, 400, NULL,
+            "the query has a name that is too long, or a %% without two hexadecimal digits, "
+            "or %%00");
+    else
+        reply_problem(c->reply, 400, NULL, "there is no query parameter \"%.40s\" here; %s%s", key,
+                      list[0] != '\0' ? "there are: " : "there is none", list);
+    return false;
+}
+
 static const char *guard_detail(int status) {
     switch (status) {
     case 401:
@@ -229,7 +283,7 @@ static bool admit(void *context, struct http_request *request, struct http_reply
                                http_header(request, "Authorization"));
     if (status != 0 && (status != 401 || !routes_is_page(http_path(request)))) {
         reply_problem(reply, status, NULL, "%s", guard_detail(status));
-    } else if (route(&call)) {
+    } else if (route(&call) && query_known(&call)) {
         // The page tells nothing about this daemon, and is where a browser is asked for the token.
         if (atomic_load(&routes->open) || call.route->serve == routes_serve_health ||
             call.route->serve == routes_serve_page)

@@ -1,4 +1,5 @@
 """Bad input: each a clear error of the right status; the daemon lives on and no other run is touched."""
+import contextlib
 import json
 import socket
 import time
@@ -264,11 +265,41 @@ def test_faults_of_request_and_scene_come_at_once(daemon):
     ["/nowhere", "/v1/", "/v2/runs", "/v1/run", "/v1/runs/", "/v1/runs/a/b", "/v1/runs/nobody", "/v1/runs/nobody/frames",
      "/v1/runs/nobody/frames/0", "/v1/runs/nobody/probes", "/v1/runs/nobody/scene", "/v1/scenes/nothing",
      "/v1/scenes/..%2f..%2fetc%2fpasswd", "/v1/runs/..%2f..", "/v1/runs/" + "a" * 65, "/v1/runs/" + "a" * 5000,
-     "/v1/runs/%00", "/v1/runs/a%00b", "/v1/runs/%ff%fe", "/v1/runs/nobody%0d%0aX:%20y", "//v1/runs", "/V1/runs",
+     "/v1/runs/%ff%fe", "/v1/runs/nobody%0d%0aX:%20y", "//v1/runs", "/V1/runs",
      "/v1/schemas/run.json"],
 )  # fmt: skip
 def test_unknown_path_is_404(daemon, path):
     daemon.ask("GET", path, status=404)
+
+
+@pytest.mark.parametrize("path", ["/v1/runs/%00", "/v1/runs/a%00b", "/healthz%00", "/v1/runs/%zz", "/v1/runs/a%2", "/v1%"])
+def test_path_with_a_zero_byte_or_a_broken_escape_is_400(daemon, path):
+    daemon.ask("GET", path, status=400)
+
+
+def test_query_that_no_route_declares_is_400_and_names_those_that_there_are(daemon, bystander):
+    """Of every route, by the document; each that is declared is taken."""
+    for path, item in daemon.get("/openapi.json")["paths"].items():
+        for method, operation in item.items():
+            url = path.replace("{id}", bystander).replace("{seq}", "0").replace("{name}", "dam-break")
+            url = url.replace("{file}", "page.css")
+            known = [p["name"] for p in operation["parameters"] if p["in"] == "query"]
+            body = {} if "requestBody" in operation else None
+            detail = daemon.ask(method.upper(), url + "?pretty=1", body, status=400).json["detail"]
+            assert '"pretty"' in detail and all(name in detail for name in known), detail
+            for name in known:
+                reply = daemon.ask(method.upper(), f"{url}?{name}=1&{name}=1", body, status=400)
+                assert f"{name} twice" in reply.json["detail"]
+
+
+@pytest.mark.parametrize(
+    "query, status",
+    [("limit=1", 200), ("", 200), ("&&limit=1&", 200), ("%6cimit=1", 200), ("limit", 400), ("Limit=1", 400), ("limit[]=1", 400),
+     ("=1", 400), ("x", 400), ("limit%00=1", 400), ("limit=1%00", 400), ("limit=%zz", 400), ("%zz=1", 400),
+     ("a" * 5000, 400), ("limit=1&state=paused", 200), ("limit=1&state=paused&stat=1", 400)],
+)  # fmt: skip
+def test_query_is_read_strictly(daemon, query, status):
+    daemon.ask("GET", "/v1/runs?" + query, status=status)
 
 
 def test_unknown_run_is_404_for_every_action(daemon):
@@ -461,15 +492,14 @@ def test_many_entries_within_the_limit_are_refused_or_taken_but_quickly(daemon):
 def raw(daemon, text, wait=True):
     address, port = daemon.host.split(":")
     with socket.create_connection((address, int(port)), timeout=20) as s:
-        try:
+        answer = b""
+        with contextlib.suppress(OSError):  # it hung up before it had read all
             s.sendall(text)
             s.shutdown(socket.SHUT_WR)
-            answer = b""
+        with contextlib.suppress(OSError):  # it hung up; what it said before counts
             while wait and (part := s.recv(65536)):
                 answer += part
-            return answer
-        except OSError:  # it hung up, or has nothing to say to that
-            return b""
+        return answer
 
 
 def test_garbage_on_the_socket_is_survived(daemon):
@@ -496,6 +526,21 @@ HEADS = {
     "length_and_chunks": (b"Host: HOST\r\nContent-Length: 2\r\nTransfer-Encoding: chunked\r\n", 400),
     "unknown_coding": (b"Host: HOST\r\nTransfer-Encoding: gzip\r\n", 400),
     "compressed_body": (b"Host: HOST\r\nContent-Encoding: gzip\r\nContent-Length: 2\r\n", 415),
+    "zero_in_host": (b"Host: HOST\0evil\r\nX-A: b\r\n", 400),
+    "zero_in_the_last_line": (b"X-A: b\r\nHost: HOST\0evil\r\n", 400),
+    "two_zeroes": (b"X-A: b\r\nHost: HOST\0\0evil\r\n", 400),
+    "zero_at_the_end": (b"Host: HOST\0\r\n", 400),
+    "zero_in_length": (b"Host: HOST\r\nContent-Length: 2\0 5\r\n", 400),
+    "zero_in_name": (b"Host: HOST\r\nX\0Y: b\r\n", 400),
+    "zero_in_token": (b"Host: HOST\r\nAuthorization: Bearer a\0b\r\nX-A: b\r\n", 400),
+    "line_that_goes_on": (b"Host: HOST\r\nX-A: b\r\n  c\r\nX-B: d\r\n", 400),
+    "no_colon": (b"Host: HOST\r\nX-A\r\n", 400),
+    "word_for_length": (b"Host: HOST\r\nContent-Length: 2x\r\n", 400),
+    "length_below_zero": (b"Host: HOST\r\nContent-Length: -2\r\n", 400),
+    "no_length": (b"Host: HOST\r\nContent-Length:\r\n", 400),
+    "length_beyond_numbers": (b"Host: HOST\r\nContent-Length: 99999999999999999999\r\n", 413),
+    "no_chunks": (b"Host: HOST\r\nTransfer-Encoding: chunked\r\n", 400),
+    "very_long_head": (b"Host: HOST\r\n" + b"X-Y: %s\r\n" % (b"z" * 500) * 140, 431),
     "long_head": (b"Host: HOST\r\n" + b"X-Y: %s\r\n" % (b"z" * 500) * 40, 431),
 }
 
@@ -509,12 +554,33 @@ def test_head_that_two_readers_would_read_differently_is_refused(daemon, case):
     lines = top.decode().split("\r\n")
     headers = [tuple(line.split(": ", 1)) for line in lines[1:]]
     reply = check_form(Reply("POST", "/v1/scenes:validate", int(lines[0].split()[1]), headers, body))
-    assert reply.status == status and answer.count(b"HTTP/1.1 ") == 1, answer
+    assert reply.status == status and answer.count(b"HTTP/1.1 %d " % status) == 1, answer
+    assert len(body) == int(reply.headers["content-length"]), "one answer and nothing behind it"
+
+
+@pytest.mark.parametrize("line", [b"GET /healthz\0evil HTTP/1.1", b"GET /healthz?\0 HTTP/1.1", b"GET\0X /healthz HTTP/1.1",
+                                  b"GET /healthz \0 HTTP/1.1"])  # fmt: skip
+def test_request_line_with_a_zero_byte_is_400(daemon, line):
+    answer = raw(daemon, line + b"\r\nHost: %s\r\n\r\n" % daemon.host.encode())
+    assert answer.startswith(b"HTTP/1.1 400 ") and b"zero byte" in answer, answer
+
+
+@pytest.mark.parametrize(
+    "head",
+    [b"GET /healthz HTTP/1.1\r\nHost: HOST\r\n\r\n", b"GET /healthz HTTP/1.1\nHost: HOST\nX-A: b\n\n",
+     b"GET /v1/runs?limit=1&state=paused HTTP/1.1\r\nHost:HOST\r\nX-A:\r\nX-B:  c  d\r\n\r\n", b"GET /healthz HTTP/1.0\r\n\r\n",
+     b"\r\n\r\nGET /v1/scenes/%64am-break HTTP/1.1\r\nHost: HOST\r\nCookie: a=b; c=d\r\nX-A: e\r\n\r\n"],
+)  # fmt: skip
+def test_head_that_is_odd_but_sound_is_served(daemon, head):
+    head = head.replace(b"HOST", daemon.host.encode())
+    answer = raw(daemon, head + head)  # on one connection, where it is kept
+    assert answer.startswith(b"HTTP/1.1 200 ") and answer.count(b"HTTP/1.1 200 ") in (1, 2), answer
+    assert b"HTTP/1.1 4" not in answer, answer
 
 
 def test_target_in_absolute_form_is_served_for_its_own_authority(daemon):
     host = daemon.host.encode()
-    for target, status in ((b"http://" + host + b"/healthz", 200), (b"http://" + host + b"/v1/runs?x", 200),
+    for target, status in ((b"http://" + host + b"/healthz", 200), (b"http://" + host + b"/v1/runs?limit=1", 200),
                            (b"HTTP://localhost/healthz", 200), (b"http://" + host, 200),
                            (b"http://evil.example/healthz", 421), (b"http://127.0.0.1@evil.example/healthz", 421),
                            (b"http:///healthz", 421), (b"ftp://" + host + b"/healthz", 404)):  # fmt: skip

@@ -4,6 +4,7 @@ import http.client
 import json
 import re
 import shutil
+import socket
 import struct
 import subprocess
 import threading
@@ -362,4 +363,21 @@ def test_file_that_is_cut_under_a_stream_ends_the_stream_and_no_more(daemon, nam
         assert got < whole
     assert daemon.request("GET", f"/v1/runs/{name}/frames/0").status == 500
     assert daemon.run(name)["state"] == "paused"
+    daemon.away(name)
+
+
+def test_head_of_a_stream_is_its_head_and_nothing_else(daemon, name):
+    daemon.create(endless(), id=name, start=False)
+    host, port = daemon.host.split(":")
+    for path in ("/v1/events", f"/v1/runs/{name}/events", f"/v1/runs/{name}/stream"):
+        with socket.create_connection((host, int(port)), timeout=PATIENCE) as s:
+            s.sendall(f"HEAD {path} HTTP/1.1\r\nHost: {daemon.host}\r\n\r\n".encode())
+            answer = b""
+            while part := s.recv(65536):  # it closes
+                answer += part
+        head, rest = answer.split(b"\r\n\r\n", 1)
+        assert head.startswith(b"HTTP/1.1 200 ") and rest == b"", answer
+        assert b"Content-Type: " + (b"application/vnd" if "stream" in path else b"text/event-stream") in head, answer
+    streams = re.compile(r"^fbard_streams (\d+)$", re.M)
+    until(lambda: streams.search(daemon.ask("GET", "/metrics").body.decode())[1] == "0")
     daemon.away(name)
