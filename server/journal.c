@@ -23,6 +23,7 @@
 
 #define ROOM_MIN ((uint64_t)1 << 20) // bytes: a small run's files and its first checkpoint
 #define FILES_MIN 16                 // a run's folder, its files, and those written beside them
+#define DESCRIPTORS_MIN 8 // that a run which begins has open at a time, and some to spare
 
 // ---- Helpers ----------------------------------------------------------------------------------
 
@@ -199,6 +200,27 @@ int journal_lock(const char *data_dir, char *why) {
     return fd;
 }
 
+// Holds as many as a new run would, for a moment: to count those that are open says nothing of the
+// system's own limit.
+static bool has_descriptors(const char *path, char *why) {
+    int held[DESCRIPTORS_MIN], error = 0;
+    size_t n = 0;
+    for (; n < DESCRIPTORS_MIN && error == 0; n++) {
+        held[n] = open(path, O_RDONLY | O_DIRECTORY | O_CLOEXEC);
+        if (held[n] < 0)
+            error = errno;
+    }
+    for (size_t k = 0; k < n; k++)
+        if (held[k] >= 0)
+            close(held[k]);
+    if (error == EMFILE || error == ENFILE)
+        journal_explain(why, "fewer than %d file descriptors are left: %s", DESCRIPTORS_MIN,
+                        strerror(error));
+    else if (error != 0)
+        journal_failure(error, path, why);
+    return error == 0;
+}
+
 bool journal_has_room(const char *data_dir, char *why) {
     char path[PATH_MAX];
     struct statvfs disk;
@@ -214,7 +236,7 @@ bool journal_has_room(const char *data_dir, char *why) {
                         (unsigned long long)room, (unsigned long long)disk.f_favail);
         return false;
     }
-    return true;
+    return has_descriptors(path, why);
 }
 
 static int compare_text(const void *a, const void *b) {

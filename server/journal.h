@@ -35,8 +35,8 @@ struct journal;
 // daemon out. The descriptor that holds the lock until it is closed, or -1.
 int journal_lock(const char *data_dir, char *why);
 
-// Whether another run's folder could be made there now: it is there, may be written to, and there
-// is room. Writes nothing.
+// Whether another run's folder could be made there now: it is there, may be written to, there is
+// room, and there are file descriptors for it. Writes nothing.
 bool journal_has_room(const char *data_dir, char *why);
 
 // Ids of all runs on disk, sorted; the caller frees the array and its strings. Also clears away

@@ -2,17 +2,19 @@
 // of single runs is told of those that are not over, so that the page stays short.
 #include <dirent.h>
 #include <math.h>
+#include <pthread.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 #include <sys/resource.h>
+#include <time.h>
 #include <unistd.h>
 
 #include "server/routes_inside.h"
 
 // Statuses that the API gives; what is not among them is counted as the last.
-static const int statuses[ROUTES_STATUSES] = {200, 201, 204, 400, 401, 403, 404, 405, 409,
-                                              412, 413, 415, 421, 422, 431, 500, 503, 507, 0};
+static const int statuses[ROUTES_STATUSES] = {200, 201, 204, 400, 401, 403, 404, 405, 409, 412,
+                                              413, 415, 421, 422, 431, 500, 503, 507, 0};
 
 void routes_tally(struct routes *routes, const struct route *route, int status, double seconds) {
     size_t row = route != NULL ? (size_t)(route - routes_table) : ROUTES_MAX, column = 0;
@@ -106,7 +108,36 @@ static void put_frames(FILE *out, struct routes *routes, double gone) {
 
 // ---- The process ------------------------------------------------------------------------------
 
+// Seconds since 1970, found once: found anew, rounding would make other starts of it. As
+// Prometheus's own clients have it: boot time and the ticks after it (proc(5)).
+static double start_time;
+
+static void find_start_time(void) {
+    struct timespec now, up;
+    unsigned long long ticks = 0;
+    char text[1024];
+    FILE *file = fopen("/proc/self/stat", "re");
+    size_t n = file != NULL ? fread(text, 1, sizeof text - 1, file) : 0;
+    if (file != NULL)
+        fclose(file);
+    text[n] = '\0';
+    const char *at = strrchr(text, ')'); // behind the name, which may hold anything
+    for (int field = 2; at != NULL && field < 22; field++)
+        at = strchr(at + 1, ' ');
+    if (at == NULL || sscanf(at, "%llu", &ticks) != 1 || clock_gettime(CLOCK_REALTIME, &now) != 0 ||
+        clock_gettime(CLOCK_BOOTTIME, &up) != 0)
+        return;
+    start_time = (double)(now.tv_sec - up.tv_sec) + 1e-9 * (double)(now.tv_nsec - up.tv_nsec) +
+                 (double)ticks / (double)sysconf(_SC_CLK_TCK);
+    start_time = round(100 * start_time) / 100; // a tick is 0.01 s
+}
+
 static void put_process(FILE *out) {
+    static pthread_once_t once = PTHREAD_ONCE_INIT;
+    pthread_once(&once, find_start_time);
+    if (start_time > 0)
+        single(out, "process_start_time_seconds", "gauge",
+               "Start of the process, seconds since 1970.", start_time);
     struct rusage usage;
     unsigned long long size = 0, resident = 0;
     FILE *file = fopen("/proc/self/statm", "re");

@@ -754,6 +754,24 @@ def test_what_was_refused_for_want_of_descriptors_is_no_run_after_a_restart(fres
     d.create(endless(), id=next(run for run in answers if run not in made))
 
 
+def test_readyz_sees_that_descriptors_have_run_out(fresh):
+    d = fresh(slots=1)
+    d.limits = {resource.RLIMIT_NOFILE: 64}
+    d.start()
+    d.ask("GET", "/readyz")
+    for k in range(60):
+        if d.request("GET", "/readyz").status != 200:
+            break
+        # Where it is ready, there is room for one more: each that waits keeps one descriptor.
+        d.ask("POST", "/v1/runs", {"id": f"r{k}", "scene": endless()}, status=201)
+    reply = d.ask("GET", "/readyz", status=503)
+    assert "descriptors" in reply.json["detail"], reply
+    d.ask("GET", "/healthz")
+    for k in range(10):
+        d.away(f"r{k}")
+    until(lambda: d.request("GET", "/readyz").status == 200)
+
+
 def test_run_that_waits_for_memory_says_so(fresh):
     d = fresh().start()
     large = endless(bodies={"bar": {"particles_per_cell": 256}}, time={"dt": 1e-4})

@@ -2,6 +2,8 @@
 import contextlib
 import http.client
 import json
+import os
+import pathlib
 import re
 import shutil
 import socket
@@ -302,6 +304,10 @@ def test_metrics_count_what_was_done(daemon, name):
     assert now["fbard_run_step", f'{{run="{name}"}}'] == 35
     assert now["fbard_journal_bytes", ""] > 0 and now["process_resident_memory_bytes", ""] > 1e6
     assert 0 < now["process_open_fds", ""] < now["process_max_fds", ""]
+    up = time.clock_gettime(time.CLOCK_BOOTTIME)
+    ticks = int(pathlib.Path(f"/proc/{daemon.process.pid}/stat").read_text().rsplit(") ", 1)[1].split()[19])
+    began = time.time() - up + ticks / os.sysconf("SC_CLK_TCK")
+    assert abs(now["process_start_time_seconds", ""] - began) < 1, "by the kernel's clocks"
     assert sum(v for (k, label), v in now.items() if k == "fbard_run_phase_seconds" and name in label) > 0
     daemon.away(name)
     assert not any(name in label for _, label in metrics(daemon)), "what is gone is not told of"
