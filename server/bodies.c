@@ -10,9 +10,6 @@
 #include "server/scene.h"
 #include "server/scene_fault.h"
 
-#define COUNTED 9007199254740992.0 // 2^53: where doubles cease to count
-#define ID_PATTERN "[A-Za-z0-9][A-Za-z0-9._-]{0,63}"
-
 enum body_type {
     BODY_FLAG,
     BODY_WHOLE,
@@ -43,12 +40,13 @@ static const struct body_key create_keys[] = {
     {"scene", BODY_SCENE, .required = true, .expected = "a built-in scene's name, or a scene"},
     {"overrides", BODY_OBJECT, .expected = "a merge patch on the scene: an object",
      .doc = "merge patch (RFC 7396) on the scene"},
-    {"id", BODY_ID, .expected = ID_PATTERN, .doc = "made up from the scene's name where it lacks"},
+    {"id", BODY_ID, .expected = RUNS_ID_PATTERN,
+     .doc = "made up from the scene's name where it lacks"},
     {"start", BODY_FLAG, .expected = "true or false", .fallback = "true"},
     {"wait_subscribers", BODY_WHOLE, .most = RUN_SUBSCRIBERS_MAX,
      .expected = "a whole number, 0 to 10000", .fallback = "0",
      .doc = "who must listen before the first frame is taken"},
-    {"recorders", BODY_IDS, .most = RECORDERS_MAX, .expected = "at most 64 names " ID_PATTERN,
+    {"recorders", BODY_IDS, .most = RECORDERS_MAX, .expected = "at most 64 names " RUNS_ID_PATTERN,
      .doc = "registered before the first frame: it is kept for them"},
     {0},
 };
@@ -66,7 +64,7 @@ static const struct body_key step_keys[] = {
     {0},
 };
 static const struct body_key acknowledge_keys[] = {
-    {"acked", BODY_WHOLE, .required = true, .least = -1, .most = COUNTED,
+    {"acked", BODY_WHOLE, .required = true, .least = -1, .most = JSON_COUNTED,
      .expected = "a whole number, -1 (nothing yet) or more",
      .doc = "number of the last frame that is safe, with all before it; -1: none yet"},
     {0},
@@ -116,8 +114,8 @@ static void check_ids(const struct body_key *key, const cJSON *value, struct fau
     struct scene_cursor at = {.parent = &list};
     cJSON_ArrayForEach(item, value) {
         if (!is_id(item))
-            scene_value_fault(faults, &at, cJSON_IsString(item) ? "pattern" : "type", ID_PATTERN,
-                              item);
+            scene_value_fault(faults, &at, cJSON_IsString(item) ? "pattern" : "type",
+                              RUNS_ID_PATTERN, item);
         at.index++;
     }
 }
@@ -227,13 +225,13 @@ static cJSON *key_schema(const struct body_key *key) {
         break;
     case BODY_ID:
         cJSON_AddStringToObject(schema, "type", "string");
-        cJSON_AddStringToObject(schema, "pattern", "^" ID_PATTERN "$");
+        cJSON_AddStringToObject(schema, "pattern", "^" RUNS_ID_PATTERN "$");
         break;
     case BODY_IDS:
         cJSON_AddStringToObject(schema, "type", "array");
         items = cJSON_AddObjectToObject(schema, "items");
         cJSON_AddStringToObject(items, "type", "string");
-        cJSON_AddStringToObject(items, "pattern", "^" ID_PATTERN "$");
+        cJSON_AddStringToObject(items, "pattern", "^" RUNS_ID_PATTERN "$");
         cJSON_AddItemToObject(schema, "maxItems", json_number(key->most));
         break;
     case BODY_SCENE:

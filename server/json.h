@@ -4,6 +4,8 @@
 #include <stdbool.h>
 #include <stddef.h>
 
+#define JSON_COUNTED 9007199254740992.0 // 2^53: where doubles, and so numbers here, cease to count
+
 // One fault of a request body; the API's error objects (docs/api.md) have the same members.
 struct fault {
     char *pointer;  // RFC 6901, owned

@@ -67,9 +67,8 @@ void routes_serve_recorders(struct call *c) {
 static void check_body(const struct call *c, struct faults *faults) {
     bodies_check(c->route->request, c->body, faults);
     if (!runs_id_valid(c->names[1]))
-        faults_add(faults, "", "pattern", "[A-Za-z0-9][A-Za-z0-9._-]{0,63}", c->names[1],
-                   "the recorder's name must match [A-Za-z0-9][A-Za-z0-9._-]{0,63}, got %.80s",
-                   c->names[1]);
+        faults_add(faults, "", "pattern", RUNS_ID_PATTERN, c->names[1],
+                   "the recorder's name must match " RUNS_ID_PATTERN ", got %.80s", c->names[1]);
 }
 
 static void put(struct call *c, struct run *run) {

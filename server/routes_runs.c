@@ -451,8 +451,8 @@ void routes_serve_action(struct call *c) {
     const cJSON *steps = json_member(c->body, "steps"), *until = json_member(c->body, "until");
     bodies_check(c->route->request, c->body, &faults);
     if (faults.count == 0) {
-        // 2^53: beyond that a double holds no whole numbers, and no run does as many steps
-        command.steps = steps != NULL ? (uint64_t)fmin(steps->valuedouble, 9007199254740992.0) : 0;
+        // No run does as many steps as doubles can count.
+        command.steps = steps != NULL ? (uint64_t)fmin(steps->valuedouble, JSON_COUNTED) : 0;
         command.until = until != NULL ? until->valuedouble : NAN;
     }
     if (faults.count > 0) {

@@ -11,7 +11,9 @@ void runs_restore(struct runs *runs, enum run_restore how);
 void runs_stop(struct runs *runs);
 void runs_free(struct runs *runs); // after runs_stop
 
-bool runs_id_valid(const char *id); // [A-Za-z0-9][A-Za-z0-9._-]{0,63}
+// Of the ids of runs, and of the names of recorders.
+#define RUNS_ID_PATTERN "[A-Za-z0-9][A-Za-z0-9._-]{0,63}"
+bool runs_id_valid(const char *id); // whether it matches
 
 enum runs_result {
     RUNS_CREATED,

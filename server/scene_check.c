@@ -993,6 +993,29 @@ static bool any_live(const struct scene_key *keys) {
     return false;
 }
 
+// A null says "not this key": of keys that there are. Whatever else is wrong with the value is
+// found once it is merged; an unknown key would be gone then.
+static void check_nulls(struct check *check, const struct scene_value *value, cJSON *patch,
+                        const struct scene_cursor *at) {
+    const struct scene_value *object = value->type == SCENE_OBJECT ? value : NULL;
+    for (size_t i = 0; value->type == SCENE_EITHER && i < value->n_items; i++)
+        if (value->items[i].type == SCENE_OBJECT)
+            object = &value->items[i];
+    cJSON *next;
+    for (cJSON *change = object && cJSON_IsObject(patch) ? patch->child : NULL; change;
+         change = next) {
+        next = change->next;
+        struct scene_cursor here = {.parent = at, .key = change->string};
+        const struct scene_key *key = find_key(object->keys, change->string);
+        if (key) {
+            check_nulls(check, &key->value, change, &here);
+        } else if (cJSON_IsNull(change)) {
+            unknown_key(check, object->keys, change->string, &here);
+            cJSON_Delete(cJSON_DetachItemViaPointer(patch, change));
+        }
+    }
+}
+
 static void check_live_keys(struct check *check, const struct scene_key *keys, cJSON *patch,
                             const struct scene_cursor *at) {
     cJSON *next;
@@ -1005,8 +1028,10 @@ static void check_live_keys(struct check *check, const struct scene_key *keys, c
             check_live_keys(check, key->value.keys, change, &here);
             continue;
         }
-        if (key && key->live)
+        if (key && key->live) {
+            check_nulls(check, &key->value, change, &here);
             continue;
+        }
         if (!key)
             unknown_key(check, keys, change->string, &here);
         else

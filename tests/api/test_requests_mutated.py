@@ -5,6 +5,7 @@ import copy
 import json
 import random
 
+import jsonschema
 import pytest
 from boxes import WATER, endless, water
 
@@ -105,16 +106,68 @@ def texts(daemon, seeds):
             daemon.away(reply.json["id"])
 
 
+WHOLE_PATCH = {
+    "fbar": {"scheme": "anchored", "a": 0.05, "C": 1}, "damping": {"local": 0.1, "mass": 0.1}, "transfer": {"blend": 0.9},
+    "time": {"dt": 1e-3, "end": 1e6}, "gravity": [0, -0.001],
+    "output": {"interval": 1e5, "fields": ["position"], "probe_interval": 1e5},
+}  # fmt: skip
+
+
+def of_a_patch(daemon):
+    """What the document says of a patch: a function that tells whether one is of its form."""
+    document = daemon.get("/openapi.json")
+    body = document["paths"]["/v1/runs/{id}/config"]["patch"]["requestBody"]
+    schema = body["content"]["application/merge-patch+json"]["schema"]
+    return jsonschema.Draft202012Validator({**schema, "components": document["components"]}).is_valid
+
+
+def test_nulls_in_a_patch_delete_known_keys_and_no_others(daemon):
+    """At every depth: what the document does not allow is a 422 at its place, and nothing is changed."""
+    run = daemon.create(endless(), start=False)["id"]
+    fits = of_a_patch(daemon)
+    inside = [()] + [way for way in places(WHOLE_PATCH) if isinstance(whole_at(way), dict)]
+    refused = taken = 0
+    for way in inside:
+        for key in [*whole_at(way), "x", "", "locl", "a/b~c", "format"]:
+            for siblings in (True, False):  # beside the other keys, and alone
+                patch = copy.deepcopy(WHOLE_PATCH) if siblings else {}
+                node = patch
+                for step in way:
+                    node = node.setdefault(step, {})
+                node[key] = None
+                before = daemon.get(f"/v1/runs/{run}/config")
+                reply = daemon.request("PATCH", f"/v1/runs/{run}/config", patch)
+                unknown = key not in whole_at(way)
+                assert fits(patch) or reply.status == 422, (patch, reply)
+                if unknown:
+                    assert not fits(patch), patch
+                    pointer = "".join("/" + s.replace("~", "~0").replace("/", "~1") for s in (*way, key))
+                    assert reply.status == 422 and reply.fault(pointer)["code"] in ("unknown_key", "immutable"), (patch, reply)
+                    assert daemon.get(f"/v1/runs/{run}/config") == before, patch
+                    refused += 1
+                else:  # 422: what must be there, as time.end and fbar.scheme
+                    assert reply.status in (200, 422), (patch, reply)
+                    taken += reply.status == 200
+    assert refused == 2 * 5 * len(inside) and taken > 10, (refused, taken)
+    daemon.away(run)
+
+
+def whole_at(way):
+    node = WHOLE_PATCH
+    for key in way:
+        node = node[key]
+    return node
+
+
 def patches(daemon, seeds):
-    whole = {"fbar": {"scheme": "anchored", "a": 0.05, "C": 1}, "damping": {"local": 0.1, "mass": 0.1},
-             "transfer": {"blend": 0.9}, "time": {"dt": 1e-3, "end": 1e6}, "gravity": [0, -0.001],
-             "output": {"interval": 1e5, "fields": ["position"], "probe_interval": 1e5}}  # fmt: skip
+    fits = of_a_patch(daemon)
     run = daemon.create(endless(), start=False)["id"]
     for seed in seeds:
-        patch = mutated(random.Random(seed), whole)
+        patch = mutated(random.Random(seed), WHOLE_PATCH)
         before = daemon.get(f"/v1/runs/{run}/config")
         reply = daemon.request("PATCH", f"/v1/runs/{run}/config", patch)
         assert reply.status in (200, 422), (seed, patch, reply)
+        assert fits(patch) or reply.status == 422, (seed, patch)
         if reply.status == 422:
             assert daemon.get(f"/v1/runs/{run}/config") == before, seed
         assert daemon.run(run)["state"] == "paused", seed
