@@ -407,9 +407,18 @@ static void test_sim_change_is_checked(void **state) {
         {MPM_SET_TIME, "/time/dt", MPM_ERR_RANGE, {.dt = -1}},
         {MPM_SET_TIME, "/time/cfl", MPM_ERR_UNSTABLE_DT, {.cfl = 0.6}},
         {MPM_SET_TIME, "/time/cfl", MPM_ERR_RANGE, {.cfl = 0}},
-        {MPM_SET_FBAR, "/fbar/a", MPM_ERR_RANGE, {.fbar = {MPM_FBAR_ANCHORED, 0, 1}}},
-        {MPM_SET_FBAR, "/fbar/keep", MPM_ERR_RANGE, {.fbar = {MPM_FBAR_ANCHORED, 1, 1, -0.1}}},
-        {MPM_SET_FBAR, "/fbar/C", MPM_ERR_RANGE, {.fbar = {MPM_FBAR_ANCHORED, 0.05, -1}}},
+        {MPM_SET_FBAR,
+         "/fbar/a",
+         MPM_ERR_RANGE,
+         {.fbar = {.scheme = MPM_FBAR_ANCHORED, .a = 0, .C = 1}}},
+        {MPM_SET_FBAR,
+         "/fbar/keep",
+         MPM_ERR_RANGE,
+         {.fbar = {.scheme = MPM_FBAR_ANCHORED, .a = 1, .C = 1, .keep = -0.1}}},
+        {MPM_SET_FBAR,
+         "/fbar/C",
+         MPM_ERR_RANGE,
+         {.fbar = {.scheme = MPM_FBAR_ANCHORED, .a = 0.05, .C = -1}}},
     };
     for (size_t c = 0; c < sizeof cases / sizeof *cases; c++) {
         struct mpm_error err = {0};

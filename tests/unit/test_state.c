@@ -205,7 +205,9 @@ static void test_state_carries_changed_settings(void **state) {
         struct mpm_sim *whole = create(), *second = create();
         advance(whole, 10);
         struct mpm_settings to = {
-            .fbar = {(enum mpm_fbar_scheme)scheme, 0.1, 0.5}, .blend = 0.95, .dt = 5e-4};
+            .fbar = {.scheme = (enum mpm_fbar_scheme)scheme, .a = 0.1, .C = 0.5},
+            .blend = 0.95,
+            .dt = 5e-4};
         assert_int_equal(mpm_change(whole, &to, MPM_SET_FBAR | MPM_SET_BLEND | MPM_SET_TIME, NULL),
                          MPM_OK);
         assert_int_equal(mpm_change_end(whole, 0.03, NULL), MPM_OK);
