@@ -152,7 +152,8 @@ def figure_14(shelf):
             return
         figure, (axis,) = curves((5.2, 3.0))
         for title, (r, t, x) in scarps.items():
-            axis.plot(t, x, **style(r.labels), label=title)
+            if np.isfinite(np.array(x, dtype=float)).any():  # else nothing has moved
+                axis.plot(t, x, **style(r.labels), label=title)
         axis.set_xlabel("t (s)"), axis.set_ylabel("scarp, X (m)"), axis.set_ylim(0, 11), axis.legend()
         save(figure, path)
 

@@ -65,9 +65,12 @@ h1 { font-size: 1.6rem; } h2 { font-size: 1.3rem; margin-top: 2.5rem; border-bot
 h3 { font-size: 1.08rem; margin: 2rem 0 .4rem; } h4 { font-size: .95rem; margin: .8rem 0 .2rem; }
 figure { margin: .8rem 0; } figure img { max-width: 100%; height: auto; } figcaption, caption { font-size: .85rem; color: #555; text-align: left; }
 table { border-collapse: collapse; font-size: .82rem; margin: .6rem 0; } th, td { border-bottom: 1px solid #ddd; padding: .15rem .6rem .15rem 0; text-align: right; }
-th:first-child, td:first-child { text-align: left; } .wide { overflow-x: auto; } dl { margin: .4rem 0; } dt { font-weight: bold; font-size: .85rem; color: #555; } dd { margin: 0 0 .4rem 0; }
+th:first-child, td:first-child, th.text, td.text { text-align: left; } td:first-child { white-space: nowrap; } .wide { overflow-x: auto; } dl { margin: .4rem 0; } dt { font-weight: bold; font-size: .85rem; color: #555; } dd { margin: 0 0 .4rem 0; }
 .verdict { border-left: .4rem solid; padding: .2rem .7rem; background: #f6f6f6; } .missing { color: #777; font-size: .85rem; } code { font-size: .9em; }
 """
+
+
+PROSE = 60  # characters: a cell with more is a sentence
 
 
 def embedded(path):
@@ -83,8 +86,10 @@ def write_table(table, folder):
                 writer.writerow(["" if v is None else f"{v:.9g}" if isinstance(v, float) else v for v in row])
     if len(table.rows) > table.shown:
         return f'<p class="missing">{html.escape(table.caption)} {len(table.rows)} rows: {table.file}</p>'
-    cells = ["".join(f"<th>{html.escape(str(h))}</th>" for h in table.header)]
-    cells += ["".join(f"<td>{html.escape(number(v))}</td>" for v in row) for row in table.rows]
+    # Columns of sentences begin at the left, of numbers and short words at the right.
+    prose = [' class="text"' if any(len(str(row[k])) > PROSE for row in table.rows) else "" for k in range(len(table.header))]
+    cells = ["".join(f"<th{c}>{html.escape(str(h))}</th>" for c, h in zip(prose, table.header))]
+    cells += ["".join(f"<td{c}>{html.escape(number(v))}</td>" for c, v in zip(prose, row)) for row in table.rows]
     return (f'<div class="wide"><table><caption>{html.escape(table.caption)}'
             f'{f" ({table.file})" if table.file else ""}</caption>'
             + "".join(f"<tr>{c}</tr>" for c in cells) + "</table></div>")  # fmt: skip

@@ -152,6 +152,16 @@ def test_scene_of_no_such_name_is_404_to_read_and_422_to_run(daemon):
     assert fault["expected"] == "one of " + ", ".join(names), "all of them, not cut"
 
 
+def test_a_scene_costs_what_its_smooth_mean_stress_takes(daemon):
+    """By frames or by a probe: a number a particle at least, and two places of 32 bytes a node that is reached."""
+    probe = {"probes": {"smooth": {"kind": "mean", "field": "mean_stress_smooth", "body": "reservoir"}}}
+    bytes_of = lambda patch: estimate(validate(daemon, {"scene": "dam-break", "overrides": patch}).json)["bytes"]
+    plain = bytes_of({"output": {"fields": ["position", "mean_stress"]}})
+    reached = 18 * 10  # nodes around 16 x 8 cells of water
+    for patch in ({"output": {"fields": ["position", "mean_stress_smooth"]}}, merged(probe, {"output": {"fields": ["position", "mean_stress"]}})):
+        assert 8 * 3200 + 64 * reached <= bytes_of(patch) - plain < 8 * 3200 + 1e6
+
+
 def test_a_scene_beyond_the_memory_limit_is_422_before_anything_is_allocated(tmp_path):
     d = Daemon(tmp_path, "--memory-limit", "100M").start()
     try:
