@@ -303,9 +303,11 @@ static const struct scene_key fbar_keys[] = {
      {.type = SCENE_NUMBER, .unit = "1", .min = 0, .max = 1},
      .fallback = "0",
      .only = 1U << MPM_FBAR_ANCHORED,
-     .doc = "share of the volume change that is not averaged; about sqrt(5 mu/K), 0.1 at nu = 0.499, "
-            "for loads on outermost particles; 0.1 for fluids that rest for long; none in plastic flow "
-            "(docs/method.md)"},
+     .doc =
+         "share of the volume change that is not averaged; about sqrt(5 mu/K), 0.1 at nu = 0.499, "
+         "for loads on outermost particles; 0.1 for fluids that rest for long; none in plastic "
+         "flow "
+         "(docs/method.md)"},
     END};
 static const struct scene_value fbar_forms[] = {
     BOOL, {.type = SCENE_OBJECT, .keys = fbar_keys, .section = "`fbar` as an object"}};
