@@ -881,7 +881,7 @@ double mpm_shape_looks(const struct mpm_shape *shape, int dim, const double *min
     }
     looks += points * (shape->kind == MPM_SHAPE_CYLINDER ? POINT_LOOKS : 1) +
              ROW_LOOKS * points / n[dim - 1];
-    const double *a = shape->points + 2 * (flat ? shape->n_points - 1 : 0);
+    const double *a = flat ? shape->points + 2 * (shape->n_points - 1) : NULL;
     for (size_t i = 0; flat && i < shape->n_points; i++) {
         const double *b = shape->points + 2 * i;
         const double length = fmin(fmax(a[0], b[0]), max[0]) - fmax(fmin(a[0], b[0]), min[0]);
