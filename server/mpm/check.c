@@ -200,29 +200,35 @@ bool mpm_check_affords(struct report *r, double looks) {
 struct search {
     bool (*takes)(void *context, const double *x);
     void *context;
+    double looks_each, looks;
+    double looks_left;
     bool found;
 };
 
 static bool search_on(void *context, const double *x, double volume) {
     struct search *s = context;
     (void)volume;
+    s->looks += s->looks_each;
     s->found = !s->takes || s->takes(s->context, x);
-    return !s->found;
+    return !s->found && s->looks <= s->looks_left;
 }
 
 bool mpm_check_finds(struct report *r, const struct mpm_def *def, const struct mpm_body_def *body,
                      const struct mpm_sieve *sieve, double looks_each,
                      bool (*takes)(void *context, const double *x), void *context) {
-    const double looks = (1 + looks_each) * mpm_seed_looks(def, body, sieve);
-    struct search search = {.takes = takes, .context = context};
+    const double looks = mpm_seed_looks(def, body, sieve);
     if (!mpm_check_affords(r, looks)) {
         return true;
     }
+    struct search search = {.takes = takes,
+                            .context = context,
+                            .looks_each = looks_each,
+                            .looks_left = MPM_MAX_LOOKS - r->looks};
     mpm_seed_sifted(def, body, sieve, search_on, &search);
     if (search.found) { // mostly at once
         r->looks -= looks;
     }
-    return search.found;
+    return !mpm_check_affords(r, search.looks) || search.found;
 }
 
 // ---- Shapes -------------------------------------------------------------------------------------

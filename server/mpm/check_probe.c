@@ -88,7 +88,8 @@ static void check_against(struct report *r, const struct mpm_def *def,
     mpm_exact_free(&e);
 }
 
-#define TABLE_LOOKS 200 // that reading a table takes as long as
+#define TABLE_LOOKS 200 // that reading a table takes as long as, where the point is in it
+#define LINE_LOOKS 8    // and a line of it, where the point is far away
 
 static bool is_in_table(void *context, const double *x) {
     double value[MPM_MAX_COMPONENTS];
@@ -115,6 +116,7 @@ void mpm_check_probe_particles(struct report *r, const struct mpm_def *def,
                                const struct mpm_probe_def *q) {
     const struct mpm_sieve sieve = sieve_of(def, q);
     const bool reads = q->kind == MPM_PROBE_ERROR && q->against.is_table;
+    const double looks_each = reads ? TABLE_LOOKS + LINE_LOOKS * (double)q->against.n : 0;
     struct mpm_table table = {0};
     bool found = false;
     if (q->kind != MPM_PROBE_ERROR && !q->has_select) {
@@ -125,7 +127,7 @@ void mpm_check_probe_particles(struct report *r, const struct mpm_def *def,
     }
     for (size_t b = 0; b < def->n_bodies && !found; b++) {
         if (q->body < 0 || q->body == (int)b) {
-            found = mpm_check_finds(r, def, &def->bodies[b], &sieve, reads ? TABLE_LOOKS : 0,
+            found = mpm_check_finds(r, def, &def->bodies[b], &sieve, looks_each,
                                     reads ? is_in_table : NULL, &table);
         }
     }

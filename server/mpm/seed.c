@@ -208,6 +208,7 @@ size_t mpm_seed_sifted(const struct mpm_def *def, const struct mpm_body_def *bod
 // That a particle takes besides. It takes more where something is done with it, but how many there
 // are is a matter of memory.
 #define PARTICLE_LOOKS 1.0
+#define SINGLE_LOOKS 5.0 // that one point takes with one edge
 
 double mpm_seed_looks(const struct mpm_def *def, const struct mpm_body_def *body,
                       const struct mpm_sieve *sieve) {
@@ -229,8 +230,8 @@ double mpm_seed_looks(const struct mpm_def *def, const struct mpm_body_def *body
             max[d] = fmin(max[d], high[d]);
         }
     }
-    if (body->shape.kind == MPM_SHAPE_POINTS) { // each against some edges of each shape
-        const double each = seen ? mpm_shape_edges(seen) / 4 : 0;
+    if (body->shape.kind == MPM_SHAPE_POINTS) { // each against, at worst, every edge
+        const double each = seen ? SINGLE_LOOKS * mpm_shape_edges(seen) : 0;
         return (double)body->shape.n_points * (PARTICLE_LOOKS + each);
     }
     looks = mpm_shape_looks(&body->shape, dim, min, max, spacing);
