@@ -36,6 +36,7 @@ CFLAGS.debug = -O0 -g3
 CFLAGS.clang = -O2 -g
 CFLAGS.asan = -O2 -g -fsanitize=address,undefined -fno-sanitize-recover=all -fno-omit-frame-pointer
 CFLAGS.tsan = -O1 -g -fsanitize=thread
+CFLAGS.tsanomp = $(CFLAGS.tsan)
 CFLAGS.coverage = -O0 -g --coverage
 CFLAGS.fuzz = -O1 -g -fsanitize=fuzzer-no-link,address,undefined -fno-sanitize-recover=all -fno-omit-frame-pointer
 # One meaning of a*b + c for every compiler; no errno, no traps; never -ffast-math.
@@ -78,12 +79,12 @@ $(B)/obj/server/mpm/kernels.o: ALL_CFLAGS += $(if $(LEVELS),-DMPM_HAS_LANES)
 # Written in vectors: what the compiler would vectorise besides is scalar for a reason. Loops over components are to be
 # unrolled, or these live in memory: GCC does so from -fpeel-loops on, clang always.
 PEEL = $(if $(findstring clang,$(CC)),,-fpeel-loops)
-LANES_FLAGS = $(if $(filter asan tsan debug coverage,$(VARIANT)),-O1,-O2 $(PEEL)) -fno-tree-vectorize -fno-tree-slp-vectorize
+LANES_FLAGS = $(if $(filter asan tsan tsanomp debug coverage,$(VARIANT)),-O1,-O2 $(PEEL)) -fno-tree-vectorize -fno-tree-slp-vectorize
 $(call levels,$(LANES_SRC)): ALL_CFLAGS += $(LANES_FLAGS)
 
 .PHONY: studies all programs deps deps-page deps-long deps-report libmpm demo report report-page report-docs check check-all check-layers check-unit \
 	check-physics check-api check-page \
-	check-cli check-loss check-hard check-asan check-clang check-fuzz check-tsan unit-programs check-long bench bench-docs bench-solver bench-peer \
+	check-cli check-loss check-hard check-asan check-clang check-fuzz check-tsan check-tsan-solver unit-programs check-long bench bench-docs bench-solver bench-peer \
 	bench-recording bench-page bench-status bench-threads bench-tutorial fuzz install uninstall format clean help
 .DELETE_ON_ERROR:
 .SECONDARY:
@@ -284,6 +285,13 @@ check-tsan: ## many clients, subscribers and patches under ThreadSanitizer
 	$(Q)FBARD=$(CURDIR)/build/tsan/fbard FBAR=$(CURDIR)/$(B)/fbar $(PYTEST) tests/api/test_threads.py tests/api/test_concurrency.py \
 	  tests/api/test_watching.py tests/api/test_connections.py tests/api/test_model.py
 
+# The solver's threads: LLVM's OpenMP tells ThreadSanitizer of its own waiting (archer), of which only its locks are seen.
+TSAN_OMP = state boundary contact kernels
+check-tsan-solver: ## the solver's threads under ThreadSanitizer, with clang 14
+	$(Q)$(MAKE) --no-print-directory -j$$(nproc) CC=clang-14 VARIANT=tsanomp OPENMP=-fopenmp=libomp $(TSAN_OMP:%=build/tsanomp/tests/unit/test_%) build/tsanomp/tests/unit/test_team
+	$(Q)set -e; export OMP_TOOL_LIBRARIES=/usr/lib/llvm-14/lib/libarcher.so TSAN_OPTIONS="ignore_noninstrumented_modules=1 suppressions=tests/unit/tsanomp.supp"; \
+	  for t in $(TSAN_OMP); do echo "== $$t"; build/tsanomp/tests/unit/test_$$t '*thread*'; done; build/tsanomp/tests/unit/test_team
+
 # The table of hard cases; `make check-long` has all of it and the ladder of time increments.
 check-hard: $(B)/runner ## the hard cases: a verdict each (bench/hard.py), none worse than recorded
 	$(Q)RUNNER=$(CURDIR)/$(B)/runner $(PYTHON) bench/hard.py $(if $(FBARD_LONG),,--quick) -o build/hard > build/hard.txt || { cat build/hard.txt; exit 1; }
@@ -311,7 +319,7 @@ check-clang: ## warnings and unit tests with clang 14
 	  build/clang/fbard build/clang/fbar check-unit
 
 check-long: deps-long deps-page ## the longer verification: minutes to hours
-	@FBARD_LONG=1 $(MAKE) --no-print-directory check-all check-clang check-tsan
+	@FBARD_LONG=1 $(MAKE) --no-print-directory check-all check-clang check-tsan check-tsan-solver
 
 bench: bench-solver bench-recording bench-status bench-threads ## speed: the kernels, what recording costs, how fast the daemon answers, when threads pay
 
