@@ -198,7 +198,7 @@ static void begin_turn(struct mpm_turn *turn, size_t begin, size_t end) {
 static bool take(struct mpm_turn *turn, bool own, size_t n, size_t *next) {
     if (!own) {
         const uint64_t now = atomic_load_explicit(&turn->next, memory_order_relaxed);
-        if ((now & UINT32_MAX) + n / MUCH >= now >> 32) {
+        if ((now & UINT32_MAX) + n / MUCH + 1 >= now >> 32) {
             return false;
         }
     }
