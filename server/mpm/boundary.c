@@ -224,8 +224,7 @@ static bool room_to_share(struct mpm_shares *shares, size_t n, int n_threads) {
     if (!shares->begin) {
         shares->begin = calloc((size_t)n_threads + 2, sizeof *shares->begin);
     }
-    return shares->begin &&
-           (n == 0 || room_for(&shares->item, 2 * n - 1, &shares->capacity, sizeof *shares->item));
+    return shares->begin && room_for(&shares->item, 2 * n, &shares->capacity, sizeof *shares->item);
 }
 
 bool mpm_walls_find_nodes(struct mpm_wall *walls, size_t n_walls, const struct mpm_grid *g) {

@@ -13,6 +13,7 @@ import pytest
 import zmq
 from boxes import merged, water
 from fbard import FINAL, until
+from frames import Frame
 from harness import check_same_recording, contents
 
 SHIM = os.environ.get("FAILING") or str(fbard.ROOT / "build" / "release" / "tests" / "failing.so")
@@ -163,9 +164,17 @@ def live_through(daemon, witness):
     witness.look()
 
 
+def computed(block):
+    """A frame but for the state that the run was in when it was taken: one that was lost is taken again, and the
+    run may be paused then where it was running."""
+    frame = Frame(block)
+    header = {key: value for key, value in frame.header.items() if key not in ("state", "fields")}
+    return header, {name: (frame.units[name], array.tobytes()) for name, array in frame.fields.items()}
+
+
 def end_of(daemon):
-    """Frames (without their headers: the epoch's number stands there) and probes of the finished run."""
-    return [daemon.frame("run", f["seq"]) for f in daemon.frames("run")], daemon.csv("run")
+    """Frames and probes of the finished run."""
+    return [computed(daemon.frame("run", f["seq"])) for f in daemon.frames("run")], daemon.csv("run")
 
 
 @pytest.fixture
