@@ -323,7 +323,7 @@ check-long: deps-long deps-page ## the longer verification: minutes to hours
 
 bench: bench-solver bench-recording bench-status bench-threads ## speed: the kernels, what recording costs, how fast the daemon answers, when threads pay
 
-# BENCH=GROUP: of one group only, e.g. kernels; `make bench-docs` makes one table of what was measured.
+# BENCH=GROUP: of one group only, e.g. kernels, or runout (a quarter of an hour, not in `make bench`); `make bench-docs` makes one table of what was measured.
 bench-solver: $(B)/bench-solver ## kernels against the plain ones, ratios and growth; JSON in build/bench.json
 	$(Q)GOMP_SPINCOUNT=$(SPIN) $< --json build/bench$(if $(BENCH),-$(BENCH)).json $(BENCH)
 

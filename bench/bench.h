@@ -32,6 +32,7 @@ void verdict_row(const char *group, const char *what, double ns, double ratio, d
 
 // A row of the JSON.
 bool wanted(const char *group);
+bool asked_for(const char *group); // by its whole name: what takes too long otherwise
 void open_row(const char *group);
 void number(const char *key, double value); // left out when it is not finite
 void text(const char *key, const char *value);

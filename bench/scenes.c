@@ -76,14 +76,15 @@ static void compare(const char *name, const char *patch, void *const *state, con
 }
 
 // One state, by two threads and by one.
-static void share(const char *name, const char *patch, const void *state, size_t bytes) {
+static void share(const char *title, const char *name, const char *patch, const void *state,
+                  size_t bytes) {
     struct run two = continue_scene(name, patch, 2, state, bytes);
     struct run one = continue_scene(name, patch, 1, state, bytes);
     struct run other = continue_scene(name, patch, 1, state, bytes);
     if (two.sim && one.sim && other.sim) {
         double ns;
         const double ratio = threads_pair(two.sim, (struct mpm_sim *[]){one.sim, other.sim}, &ns);
-        close_verdict(name, "spread out, two threads / one", ns, ratio, 1 / 1.7, two.sim);
+        close_verdict(title, "spread out, two threads / one", ns, ratio, 1 / 1.7, two.sim);
     }
     close_run(&two);
     close_run(&one);
@@ -206,7 +207,7 @@ static void whole_scene(const char *name, const char *patch, double spread) {
     if (moment == MOMENTS) {
         compare(name, patch, state, bytes, 2, 0);
         meeting(name, patch, state[1], bytes[1]);
-        share(name, patch, state[1], bytes[1]);
+        share(name, name, patch, state[1], bytes[1]);
     }
     for (int k = 0; k < MOMENTS; k++) {
         free(state[k]);
@@ -238,7 +239,32 @@ static void landslide(void) {
     }
 }
 
+// The landslide while it runs out, as the whole run comes to it: a quarter of an hour.
+static void runout(void) {
+    struct run run = open_scene("landslide", "{}", 2);
+    struct mpm_error err = {0};
+    while (run.sim && mpm_time(run.sim) < 2.5) {
+        if (mpm_step(run.sim, &err)) {
+            printf("FAILED: landslide: %s\n", err.message);
+            close_run(&run);
+            return;
+        }
+    }
+    const size_t bytes = run.sim ? mpm_state_bytes(run.sim) : 0;
+    void *state = malloc(bytes + 1);
+    if (run.sim && state) {
+        mpm_state_save(run.sim, state);
+        share("landslide, 311,250 particles, at 2.5 s", "landslide", "{}", state, bytes);
+    }
+    free(state);
+    close_run(&run);
+}
+
 void scenes(void) {
+    if (asked_for("runout")) {
+        puts("\nThe landslide's run-out");
+        runout();
+    }
     if (!wanted("scenes")) {
         return;
     }

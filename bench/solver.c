@@ -297,6 +297,10 @@ bool wanted(const char *group) {
     return strstr(group, filter) != NULL;
 }
 
+bool asked_for(const char *group) {
+    return strcmp(filter, group) == 0;
+}
+
 // ---- Kernels against the plain ones ----
 
 // Multiply-adds of one double and bytes that a particle takes at the least (docs/design.md), with
@@ -764,8 +768,10 @@ int main(int argc, char **argv) {
         } else if (strcmp(argv[k], "--json") == 0 && k + 1 < argc) {
             path = argv[++k];
         } else if (argv[k][0] == '-') {
-            fprintf(stderr, "usage: bench-solver [--quick] [--json FILE] [GROUP]\n"
-                            "groups: kernels stages ratios threads features sort growth scenes\n");
+            fprintf(stderr,
+                    "usage: bench-solver [--quick] [--json FILE] [GROUP]\n"
+                    "groups: kernels stages ratios threads features sort growth scenes; and, "
+                    "only where it is named, runout\n");
             return 2;
         } else {
             filter = argv[k];
