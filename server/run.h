@@ -139,7 +139,7 @@ struct run_host {
 
 // Particles that repay a thread: with fewer each, the barriers of a step take longer than its work
 // is shortened by, many times longer where other programs want the cores (`make bench-threads`).
-#define RUN_PARTICLES_PER_THREAD 8192
+#define RUN_PARTICLES_PER_THREAD 4096
 // Solver threads of a run of so many particles. Its results do not depend on them.
 int run_threads(const struct run_host *host, uint64_t particles);
 

@@ -109,8 +109,8 @@ def test_process_is_called_by_its_name(daemon):
 
 
 def test_small_runs_have_fewer_threads_unless_told_otherwise(fresh):
-    """`--help`: cores / slots; fewer for a small run (one for each 8,192 particles)."""
-    for threads, small, large in ((None, 1, min(len(os.sched_getaffinity(0)), 51200 // 8192)), (3, 3, 3)):
+    """`--help`: cores / slots; fewer for a small run (one for each 4,096 particles)."""
+    for threads, small, large in ((None, 1, min(len(os.sched_getaffinity(0)), 51200 // 4096)), (3, 3, 3)):
         d = fresh(slots=1, threads=threads).start()
         for cell, particles, wanted in ((0.25, 3200, small), (0.0625, 51200, large)):
             run = d.create("dam-break", start=False, overrides={"cell": cell})
