@@ -760,12 +760,13 @@ def test_readyz_sees_that_descriptors_have_run_out(fresh):
     d.start()
     d.ask("GET", "/readyz")
     for k in range(60):
-        if d.request("GET", "/readyz").status != 200:
+        reply = d.request("GET", "/readyz")
+        if reply.status != 200:
             break
         # Where it is ready, there is room for one more: each that waits keeps one descriptor.
         d.ask("POST", "/v1/runs", {"id": f"r{k}", "scene": endless()}, status=201)
-    reply = d.ask("GET", "/readyz", status=503)
-    assert "descriptors" in reply.json["detail"], reply
+    # The one answer is what counts: connections that end give their descriptors back a moment later.
+    assert reply.status == 503 and "descriptors" in reply.json["detail"], reply
     d.ask("GET", "/healthz")
     for k in range(10):
         d.away(f"r{k}")
