@@ -52,7 +52,7 @@ def main():
     of = lambda *groups: [r for r in rows if r["group"] in groups]  # noqa: E731
     calibration = of("calibration")
     print("# What `make bench` measured\n")
-    print("Made by `make bench-docs` from the JSON of `make bench` (its groups one after another: `make bench-solver BENCH=kernels` and so on, and `make bench-recording`). "
+    print("Made by `make bench-docs` from the JSON of `make bench` (its groups one after another: `make bench-solver BENCH=kernels` and so on, `runout` among them, and `make bench-recording`). "
           "Every row is a median of rounds in which the things compared took turns (two threads against the mean of two runs of one thread each at the same time, so that what cores lose when both are at work is in both); [design.md](design.md#the-kernels) says what the limits are. In brackets what was asked for, "
           "on the machine of the goals: ns on another machine, and so the share of the limit, are no verdict, the ratios are. Groups that were measured more than once have a row a time: machines that others share change by a factor of 1.5 from one minute to the next, and two threads feel it first.\n")  # fmt: skip
     if calibration:
