@@ -311,6 +311,15 @@ static void place_of_node(const struct mpm_grid *g, uint32_t node, int *place) {
     }
 }
 
+// Whose a place is: 0 .. n - 1, or n, which is all of them. `sums`: a wall adds to a reaction.
+static uint32_t share_of(const struct mpm_wall *walls, size_t n_walls, const int *place,
+                         const struct mpm_grid *g, const uint32_t *cut, int n, bool sums) {
+    if (n == 1) {
+        return 0;
+    }
+    return (uint32_t)(sums ? n : owner_of_place(walls, n_walls, place, g, cut, n));
+}
+
 // Owners (n_items), 0 .. n, to lists.
 static void list_by_owner(struct mpm_shares *shares, const uint32_t *owner, size_t n_items, int n) {
     memset(shares->begin, 0, ((size_t)n + 2) * sizeof *shares->begin);
@@ -339,19 +348,14 @@ bool mpm_walls_share(struct mpm_wall *walls, size_t n_walls, const struct mpm_gr
         struct mpm_wall *w = &walls[k];
         uint32_t *owner = w->columns_of.item + w->n_columns;
         for (size_t i = 0; i < w->n_columns; i++) {
-            owner[i] =
-                n == 1 ? 0
-                : sums ? (uint32_t)n
-                       : (uint32_t)owner_of_place(walls, n_walls, w->column[i].place, g, cut, n);
+            owner[i] = share_of(walls, n_walls, w->column[i].place, g, cut, n, sums);
         }
         list_by_owner(&w->columns_of, owner, w->n_columns, n);
         owner = w->beyond_of.item + w->n_beyond;
         for (size_t i = 0; i < w->n_beyond; i++) {
             int place[MPM_MAX_DIM];
             place_of_node(g, w->beyond[i].node, place);
-            owner[i] = n == 1 ? 0
-                       : sums ? (uint32_t)n
-                              : (uint32_t)owner_of_place(walls, n_walls, place, g, cut, n);
+            owner[i] = share_of(walls, n_walls, place, g, cut, n, sums);
         }
         list_by_owner(&w->beyond_of, owner, w->n_beyond, n);
         w->n_parts = n;

@@ -224,7 +224,7 @@ static void end_turn(const struct mpm_sim *sim, int own, const struct mpm_span_r
 
 // Work that adds to the grid goes tile by tile. A tile waits for those near it with lower colours,
 // so that every node's sum has one order whatever the number of threads (order.h). Each thread does
-// its own part of the tiles first, then what others have not begun. Nobody waits for a tile that
+// its own part of the tiles first, then what others are far from. Nobody waits for a tile that
 // nobody will do: those that other parts wait for come first and by colour (order.c), so that of
 // all that are being done there, the one with the lowest colour waits for none that is, and a
 // part's next is always done or taken by the one whose part it is.
