@@ -9,7 +9,7 @@ PACKAGES = build-essential pkg-config libmicrohttpd-dev libcjson-dev libzmq3-dev
 # Needed by some targets only: the browser that tests the live page, and npm where there is no other one; clang
 # builds and the fuzzers; `make check-long`.
 PACKAGES_PAGE = chromium $(if $(shell command -v npm),,nodejs npm)
-PACKAGES_CLANG = clang-14 libomp-14-dev
+PACKAGES_CLANG = clang-14 libclang-rt-14-dev libomp-14-dev
 PACKAGES_LONG = $(PACKAGES_CLANG) python3-paraview octave fonts-freefont-otf ghostscript prometheus zsh groff-base systemd iproute2 procps
 # Pictures of the report; `make check` tests it, and so needs them too.
 PACKAGES_REPORT = python3-matplotlib python3-pil
