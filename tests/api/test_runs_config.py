@@ -237,7 +237,9 @@ def test_patch_of_a_run_that_waits_for_its_slot_after_a_restart(fresh):
     d.stop()
     d.slots = 1
     d.start()
-    waits = until(lambda: [r["id"] for r in d.get("/v1/runs")["runs"] if r["state"] == "queued"])[0]
+    # Both are queued until one has been given the only slot.
+    states = until(lambda: (lambda by: "running" in by and by)({r["state"]: r["id"] for r in d.get("/v1/runs")["runs"]}))
+    waits = states["queued"]
     reply = d.ask("PATCH", f"/v1/runs/{waits}/config", {"time": {"end": 0.5}}, status=503)
     assert "pause it" in reply.json["detail"], reply
     at = d.act(waits, "pause")
