@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1] / "api"))
+sys.path[:0] = [str(pathlib.Path(__file__).resolve().parents[1] / folder) for folder in (".", "api")]
 
 # Memory spares the suite some thousand waits for the disk; what fsync promises is tested by its calls.
 if os.access("/dev/shm", os.W_OK):

@@ -5,7 +5,6 @@ import json
 import os
 import random
 import signal
-import socket
 import subprocess
 import threading
 import time
@@ -13,16 +12,11 @@ import time
 import h5py
 
 import fbard
+import ports
 from fbard import FINAL, ROOT, until
 
 FBAR = os.environ.get("FBAR") or str(ROOT / "build" / "fbar")
 AWAY = (OSError, http.client.HTTPException)  # what a killed daemon looks like from outside
-
-
-def free_port():
-    with socket.socket() as s:
-        s.bind(("127.0.0.1", 0))
-        return s.getsockname()[1]
 
 
 class Place(fbard.Daemon):
@@ -30,7 +24,8 @@ class Place(fbard.Daemon):
 
     def __init__(self, folder, *options, **more):
         super().__init__(folder, *options, **more)
-        self.addresses = [f"127.0.0.1:{free_port()}", f"tcp://127.0.0.1:{free_port()}"]
+        http_port, publish_port = ports.fixed(2)
+        self.addresses = [f"127.0.0.1:{http_port}", f"tcp://127.0.0.1:{publish_port}"]
         self.recorders = []
 
     def command(self):
@@ -98,12 +93,14 @@ def check_same_recording(ours, theirs):
 
 class Control(threading.Thread):
     """What an operator does to a run whose daemon may be away at any moment: runs it to each step of the
-    plan, changes the configuration there, and lets it go on to its end."""
+    plan, changes the configuration there, and lets it go on to its end, but not further than `allowed`, a share of its
+    time."""
 
     def __init__(self, place, scene, plan, run="run", recorders=()):
         super().__init__(daemon=True)
         self.place, self.scene, self.plan, self.id = place, scene, plan, run
         self.recorders, self.fault, self.created = list(recorders), None, threading.Event()
+        self.allowed = 1.0
 
     def once(self, method, path, body=None):
         """The reply, or None while the daemon is away or asks for patience."""
@@ -134,8 +131,13 @@ class Control(threading.Thread):
                 assert run["step"] <= step, run
                 if run["step"] == step:
                     return
-                self.ask("POST", f"/v1/runs/{self.id}:step", {"steps": step - run["step"]}, good=(200, 409))
+                self.step({"steps": step - run["step"]})
             time.sleep(0.01)
+
+    def step(self, body):
+        """Once: if its answer is lost, it may be where it was to by the next look, and must not be told so again."""
+        reply = self.once("POST", f"/v1/runs/{self.id}:step", body)
+        assert reply is None or reply[0] in (200, 409), reply
 
     def go(self):
         body = {"scene": self.scene, "id": self.id, "start": False, "recorders": self.recorders}
@@ -148,8 +150,14 @@ class Control(threading.Thread):
             run = self.state()
             if run["state"] in FINAL:
                 return
-            if run["state"] == "paused":
+            if run["state"] == "paused" and self.allowed >= 1:
                 self.ask("POST", f"/v1/runs/{self.id}:resume", good=(200, 409))
+            elif run["state"] == "paused":
+                # Between two frames: one that is taken while it is paused there would say so.
+                interval = self.scene["output"]["interval"]
+                stop = (round(self.allowed * run["end_time"] / interval) - 0.5) * interval
+                if stop > run["time"] + 0.25 * interval:
+                    self.step({"until": stop})
             time.sleep(0.02)
 
     def run(self):
@@ -181,9 +189,11 @@ def undisturbed(place, scene, plan):
 
 
 def disturbed(place, scene, plan, rng, kills, files=("a.h5",), longest=0.5):
-    """The same with `kills` kills at random moments, as far as the run lasts; how many there were."""
+    """The same with `kills` kills at random moments; how many there were. The run comes no further than a share of it for
+    each kill, so that it is not over before them, however slowly they go."""
     place.start()
     control = Control(place, scene, plan)
+    control.allowed = 1 / kills
     control.start()
     assert control.created.wait(fbard.PATIENCE) and not control.fault, control.fault
     recorders = {file: place.record("run", file) for file in files}
@@ -207,6 +217,7 @@ def disturbed(place, scene, plan, rng, kills, files=("a.h5",), longest=0.5):
         if victim != "recorder":
             place.kill()
         done[victim] += 1
+        control.allowed = (1 + sum(done.values())) / kills
         if victim != "daemon":
             recorders[file].wait()
         if rng.random() < 0.3:

@@ -8,7 +8,7 @@ import time
 import pytest
 import zmq
 from boxes import merged, water
-from fbard import is_sanitized, until
+from fbard import PATIENCE, is_sanitized, until
 from harness import check_same_recording, contents
 
 BUDGET = 1_000_000
@@ -144,18 +144,19 @@ def test_stopped_recorder_holds_the_run_until_it_goes_on(place):
     for d in (wide, daemon):
         d.act("run", "resume")
     run = daemon.wait("run", "waiting")
-    assert sorted(r["acked"] for r in run["recorders"])[0] == 0 or run["recorders"][0]["acked"] < 5
+    assert min(r["acked"] for r in run["recorders"]) < 5
     time.sleep(0.5)
     assert daemon.run("run")["state"] == "waiting" and daemon.run("run")["step"] < 600
     recorder.send_signal(signal.SIGCONT)
-    assert recorder.wait(60) == other.wait(60) == whole.wait(60) == 0, daemon.said("a.h5")
+    assert {r.wait(PATIENCE) for r in (recorder, other, whole)} == {0}, daemon.said("a.h5")
     assert daemon.run("run")["state"] == "completed"
     for file in ("a.h5", "b.h5"):
         check_same_recording(daemon.folder / file, wide.folder / "a.h5")
 
 
 def test_durability_and_budget_change_while_it_runs(daemon):
-    scene = merged(POOL, {"time": {"end": 2}, "output": {"journal_bytes": 10**8}})
+    # It ends when it is told to, and not before all this was done; 10,000 frames fit into its journal, 200,000 steps.
+    scene = merged(POOL, {"time": {"end": 1e3}, "output": {"journal_bytes": 10**8, "interval": 0.02}})
     daemon.create(scene, id="run", recorders=["slow"])
     for k in range(10):
         step = daemon.run("run")["step"]
@@ -165,7 +166,7 @@ def test_durability_and_budget_change_while_it_runs(daemon):
     run = daemon.wait("run", "waiting")
     frames = index(daemon)
     assert frames["first"] == 0 and run["warnings"] and run["epoch"] == 0
-    daemon.patch("run", {"output": {"journal_bytes": 10**8}})
+    daemon.patch("run", {"output": {"journal_bytes": 10**8}, "time": {"end": run["time"] + 0.2}})
     daemon.wait("run", "completed")
     assert index(daemon)["first"] == 0
 
@@ -221,6 +222,6 @@ def test_viewers_that_stall_cost_no_memory_and_no_frames(daemon):
         for viewer in viewers:
             viewer.close(0)
         context.term()
-    until(lambda: resident(daemon, "RssFile") < 20 * first, 20)
+    until(lambda: resident(daemon, "RssFile") < 20 * first)
 
 
