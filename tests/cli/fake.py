@@ -7,6 +7,7 @@ import threading
 import time
 
 import numpy as np
+import ports
 import zmq
 
 _xxhash = ctypes.CDLL("libxxhash.so.0")
@@ -99,7 +100,7 @@ class Fake:
             "front": {"kind": "extent", "axis": "x", "side": "max", "body": "water"},
             "force": {"kind": "reaction", "wall": "floor"}}}
         self.problem = None
-        self.http_port = self.publish_port = 0
+        self.http_port, self.publish_port = ports.fixed(2)
         self.up()
 
     # -- life ------------------------------------------------------------------------------------
@@ -141,22 +142,18 @@ class Fake:
         self.closing = False
         Server.connections = []
         self.server = Server(("127.0.0.1", self.http_port), Handler)
-        self.http_port = self.server.server_address[1]
         self.url = f"http://127.0.0.1:{self.http_port}"
         self.thread = threading.Thread(target=self.server.serve_forever, args=(0.01,), daemon=True)
         self.thread.start()
         self.context = zmq.Context()
         self.pub = self.context.socket(zmq.PUB)
         self.pub.linger = 0
-        if self.publish_port:
-            for _ in range(100):
-                try:
-                    self.pub.bind(f"tcp://127.0.0.1:{self.publish_port}")
-                    break
-                except zmq.ZMQError:
-                    time.sleep(0.02)
-        else:
-            self.publish_port = self.pub.bind_to_random_port("tcp://127.0.0.1")
+        while True:
+            try:
+                self.pub.bind(f"tcp://127.0.0.1:{self.publish_port}")
+                break
+            except zmq.ZMQError:  # the one before is being closed
+                time.sleep(0.02)
 
     def down(self):
         self.closing = True
@@ -196,9 +193,12 @@ class Fake:
             return answer
         self.route = advancing
 
-    def play(self, interval=0.01, live=True):
+    def play(self, interval=0.01, live=True, until=None):
+        """All frames, one after the other; the last one not before the event `until`."""
         def go():
             while self.ready < len(self.frames) and not self.closing:
+                if until and self.ready == len(self.frames) - 1:
+                    until.wait()
                 self.advance(live=live)
                 time.sleep(interval)
         thread = threading.Thread(target=go, daemon=True)

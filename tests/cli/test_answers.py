@@ -1,18 +1,11 @@
 """What fbar says: JSON where it is asked for, colours on terminals only, and what to do next."""
-import fcntl
 import json
 import os
-import pty
 import re
-import select
-import struct
-import subprocess
-import termios
-import time
 
 import pytest
 
-import conftest
+from conftest import on_a_terminal
 
 ESCAPE = re.compile(r"\x1b\[[0-9;]*m")
 
@@ -62,27 +55,6 @@ def test_json_of_a_fault_says_what_is_wrong(fbar, fake):
     assert result.returncode == 3 and parsed(result)["exit_code"] == 3 and "127.0.0.1:1" in parsed(result)["faults"][0]
     result = fbar("--json", "info", "none.h5")
     assert result.returncode == 4 and parsed(result)["faults"] == [result.stderr.removeprefix("fbar: ").strip()]
-
-
-def on_a_terminal(*words, columns=80, **more):
-    """What fbar writes to a terminal, standard output and error together."""
-    leader, follower = pty.openpty()
-    fcntl.ioctl(follower, termios.TIOCSWINSZ, struct.pack("HHHH", 24, columns, 0, 0))
-    process = subprocess.Popen([conftest.FBAR, *map(str, words)], stdout=follower, stderr=follower, stdin=follower,
-                               env={**conftest.environment(), "TERM": "xterm", "LC_ALL": "C.UTF-8", **more})  # fmt: skip
-    os.close(follower)
-    text, end = b"", time.monotonic() + 20
-    while time.monotonic() < end:
-        try:
-            if select.select([leader], [], [], 0.1)[0]:
-                text += os.read(leader, 65536)
-            elif process.poll() is not None:
-                break
-        except OSError:  # the other end is closed
-            break
-    os.close(leader)
-    process.wait(10)
-    return text.decode()
 
 
 def test_colours_are_for_terminals(fbar, fake):

@@ -39,7 +39,7 @@ def root(tmp_path_factory):
 
 
 def run(*words, **options):
-    return subprocess.run([str(w) for w in words], capture_output=True, text=True, timeout=60,
+    return subprocess.run([str(w) for w in words], capture_output=True, text=True, timeout=conftest.PATIENCE,
                           **{"env": BARE, **options})
 
 
@@ -162,7 +162,7 @@ def test_everything_works_in_an_empty_root(root, tmp_path):
         assert (new / "tmp/a.h5").read_bytes()[:4] == b"\x89HDF"
     finally:
         daemon.terminate()
-        assert daemon.wait(20) == 0
+        assert daemon.wait(conftest.PATIENCE) == 0
 
 
 @pytest.mark.long

@@ -6,7 +6,6 @@ import pathlib
 import re
 import shlex
 import subprocess
-import time
 
 import pytest
 
@@ -40,19 +39,17 @@ def url(tmp_path):
             [conftest.FBARD, "--http", "127.0.0.1:0", "--publish", "tcp://127.0.0.1:0", "--port-file",
              str(ports), "--data-dir", str(tmp_path / "data"), "--slots", "2"], stderr=log)
     try:
-        end = time.monotonic() + 60
-        while not ports.exists():
-            assert process.poll() is None and time.monotonic() < end, (tmp_path / "fbard.log").read_text()
-            time.sleep(0.01)
+        conftest.wait_until(lambda: process.poll() is not None or ports.exists())
+        assert process.poll() is None, (tmp_path / "fbard.log").read_text()
         yield json.loads(ports.read_text())["http"]
     finally:
         process.terminate()
-        assert process.wait(20) == 0
+        assert process.wait(conftest.PATIENCE) == 0
 
 
 def curl(words, url):
     """(HTTP status, content type, body) of a curl line; one that is refused fails."""
-    extra = ["-sS", "--max-time", "10", "-w", "\n%{http_code} %{content_type}"]
+    extra = ["-sS", "--max-time", "100", "-w", "\n%{http_code} %{content_type}"]
     done = subprocess.run([words[0], *extra, *(w.replace(ADDRESS, url) for w in words[1:])],
                           capture_output=True, text=True)
     assert done.returncode == 0, (words, done.stderr)
@@ -90,7 +87,7 @@ def test_client_lines(url, tmp_path):
         assert words[0] == "build/fbar", f"no test runs {words}"
         extra = SHORT if words[1] == "run" else []
         done = subprocess.run([conftest.FBAR, *words[1:], *extra], capture_output=True, text=True,
-                              timeout=30, cwd=tmp_path, env={**conftest.environment(), "FBAR_URL": url})
+                              timeout=conftest.PATIENCE, cwd=tmp_path, env={**conftest.environment(), "FBAR_URL": url})
         assert done.returncode == 0, (words, done.stderr)
         for flag, name in zip(words, words[1:]):
             if flag == "-o":
@@ -245,13 +242,16 @@ def test_tutorial_lines_work_in_their_order(url, tmp_path):
             steered = ["show", words[words.index("--id") + 1]]
         elif words[1] == "run" and words[2] == "dam-break":
             more = MADE_SHORT
-        elif words[1] == "record":  # what was steered ends a thousand steps later
-            run = json.loads(subprocess.run([conftest.FBAR, "--json", *steered], capture_output=True, text=True,
-                                            env=environment).stdout)  # fmt: skip
-            subprocess.run([conftest.FBAR, "set", steered[1], f"time.end={max(run['time'], 0) + 0.01}"], env=environment,
-                           check=True, capture_output=True)  # fmt: skip
+        elif words[1] == "record":  # what was steered ends a thousand steps later, which are not over before it is told
+            def steer(*words):
+                return subprocess.run([conftest.FBAR, "--json", *words], capture_output=True, text=True, env=environment,
+                                      check=True).stdout  # fmt: skip
+
+            time = json.loads(steer("pause", steered[1]))["time"]
+            steer("set", steered[1], f"time.end={max(time, 0) + 0.01}")
+            steer("resume", steered[1])
         line = " ".join(shlex.quote(w) if w != ">" else w for w in [*words, *more])
-        done = subprocess.run(["sh", "-c", line], cwd=folder, env=environment, capture_output=True, text=True, timeout=100)
+        done = subprocess.run(["sh", "-c", line], cwd=folder, env=environment, capture_output=True, text=True, timeout=conftest.PATIENCE)
         assert done.returncode == 0, (line, done.stdout, done.stderr)
         for flag, name in zip(words, words[1:]):
             if flag == "-o":

@@ -5,14 +5,13 @@ import os
 import re
 import signal
 import subprocess
-import time
 
 import h5py
 import numpy as np
 import pytest
 from PIL import Image
 
-from conftest import FBAR, FBARD, ROOT
+from conftest import FBAR, FBARD, ROOT, wait_until
 
 FIGURES = ("3", "4", "5", "6", "8", "9", "10", "12", "14", "15", "16")
 
@@ -35,10 +34,8 @@ def made(tmp_path_factory):
     """(folder, what the report printed): it was killed with kill -9 in mid-run, and called again."""
     folder = tmp_path_factory.mktemp("report")
     first = report(folder)
-    until = time.monotonic() + 60
-    while not list((folder / "runs").glob("*.h5.log")):
-        assert first.poll() is None and time.monotonic() < until
-        time.sleep(0.02)
+    wait_until(lambda: first.poll() is not None or list((folder / "runs").glob("*.h5.log")))
+    assert first.poll() is None
     first.send_signal(signal.SIGKILL)
     first.communicate()
     return folder, finished(report(folder))
