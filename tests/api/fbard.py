@@ -12,7 +12,8 @@ import time
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 PROGRAM = os.environ.get("FBARD") or str(ROOT / "build" / "fbard")
-# Sanitizers make the daemon several times slower; a busy machine is allowed for besides.
+# Sanitizers make the daemon several times slower; a busy machine is allowed for besides. No test measures anything by
+# it: what would take so long hangs.
 PATIENCE = 120.0
 FINAL = ("completed", "failed", "cancelled")
 STATES = ("queued", "running", "waiting", "paused") + FINAL
@@ -28,14 +29,17 @@ def is_sanitized():
 
 
 def until(condition, seconds=PATIENCE, every=0.005):
-    """The first true value of `condition`, asked again and again."""
-    end = time.monotonic() + seconds
+    """The first true value of `condition`, asked again and again. Where all stood still between two looks, as machines do
+    now and then, only a second of it counts."""
+    left, now = seconds, time.monotonic()
     while True:
         value = condition()
         if value:
             return value
-        assert time.monotonic() < end, f"not within {seconds} s: {condition}"
+        assert left > 0, f"not within {seconds} s: {condition}"
         time.sleep(every)
+        before, now = now, time.monotonic()
+        left -= min(now - before, 1.0)
 
 
 def strict_json(text):
@@ -191,6 +195,17 @@ class Daemon:
     def n_threads(self):
         return len(os.listdir(f"/proc/{self.process.pid}/task"))
 
+    def cpu_seconds(self):
+        """Processor time of the process, by the kernel's account (proc(5): utime, stime)."""
+        with open(f"/proc/{self.process.pid}/stat") as f:
+            fields = f.read().rsplit(")", 1)[1].split()
+        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+    def was_over(self, run):
+        """Whether a run was over when its daemon was killed or stopped, by what is on the disk."""
+        log = (self.data / "runs" / run / "events.jsonl").read_text()
+        return any(f'"state":"{state}"' in log for state in FINAL)
+
     # ---- HTTP ----
 
     def request(self, method, path, body=None, headers=None, check=True):
@@ -241,6 +256,11 @@ class Daemon:
 
         return until(there)
 
+    def settle(self, run):
+        """Until a run that was created and not started has its simulation and its first frame, after which nothing of it
+        changes by itself."""
+        return until(lambda: (now := self.run(run))["balance"]["mass"] and now["journal"]["frames"] > 0 and now)
+
     def wait_step(self, run, step):
         """Until it has come so far."""
         return until(lambda: (now := self.run(run))["step"] >= step and now)
@@ -264,6 +284,7 @@ class Daemon:
             if self.run(run)["state"] not in FINAL:
                 reply = self.request("POST", f"/v1/runs/{run}:cancel")
                 assert reply.status in (200, 409), reply  # it may have ended meanwhile
+                until(lambda run=run: self.run(run)["state"] in FINAL)  # a slow disk has it wait for its last frame
             self.ask("DELETE", f"/v1/runs/{run}", status=204)
 
 

@@ -1,11 +1,12 @@
 """Many clients at once: nothing is lost, nothing blocks."""
 import concurrent.futures
+import pathlib
 import random
 import time
 
 import pytest
 from boxes import big, endless, water
-from fbard import FINAL, STATES, is_sanitized, until
+from fbard import FINAL, PATIENCE, STATES, is_sanitized, until
 from frames import Frame
 
 
@@ -17,7 +18,7 @@ def test_hammered_runs_stay_consistent(daemon):
     def client(seed):
         random_ = random.Random(seed)
         counts, steps = {}, dict.fromkeys(runs, 0)
-        while time.monotonic() < end:
+        while time.monotonic() < end or counts.get(200, 0) < 15:
             run = random_.choice(runs)
             what = random_.randrange(10)
             if what < 4:
@@ -76,32 +77,32 @@ def test_watching_changes_no_result(daemon):
     daemon.away(alone, watched)
 
 
-def test_status_answers_in_50_ms_while_big_steps_are_made(daemon):
-    runs = [daemon.create(big())["id"] for _ in range(2)]
+def test_status_does_not_wait_for_the_end_of_a_step(daemon):
+    """However long the machine takes for either: several answers come within one step. (In ms: `make bench-status`.)"""
+    runs = [daemon.create(big(particles_per_cell=400))["id"] for _ in range(2)]  # 160,000 particles
     for run in runs:
         daemon.wait_step(run, 1)
+    last, answers = -1, 0
 
-    def quick():
-        times = []
-        for _ in range(30):
-            start = time.monotonic()
-            assert daemon.run(runs[0])["state"] == "running"
-            times.append(time.monotonic() - start)
-        times.sort()
-        return times[len(times) * 9 // 10] < (0.5 if is_sanitized() else 0.05)
+    def several():
+        nonlocal last, answers
+        now = daemon.run(runs[0])
+        assert now["state"] == "running"
+        answers = answers + 1 if now["step"] == last else 1
+        last = now["step"]
+        return answers == 6
 
-    # The machine may be busy with something else; that it is so each time is unlikely.
-    assert any(quick() for _ in range(5))
+    until(several, every=0)
     daemon.away(*runs)
 
 
 def test_actions_take_effect_at_the_next_step_boundary(daemon):
-    run = daemon.create(big())["id"]
+    run = daemon.create(big(particles_per_cell=400))["id"]
     daemon.wait_step(run, 2)
-    start = time.monotonic()
     before = daemon.run(run)["step"]
-    assert daemon.act(run, "pause")["effective_step"] >= before
-    assert time.monotonic() - start < 10
+    paused = daemon.act(run, "pause")
+    assert paused["state"] == "paused" and paused["effective_step"] >= before
+    assert daemon.run(run)["step"] == paused["effective_step"] == paused["step"]
     daemon.away(run)
 
 
@@ -155,7 +156,7 @@ def test_commands_to_a_run_that_is_stopped_are_all_answered(fresh):
         jobs = [pool.submit(ask, k) for k in range(4)]
         time.sleep(0.2)
         d.process.send_signal(signal.SIGTERM)
-        assert d.process.wait(60) == 0
+        assert d.process.wait(PATIENCE) == 0
         for job in jobs:
             job.result()
     d.process = None
@@ -178,7 +179,18 @@ def test_thousand_runs_come_and_go(daemon):
         assert daemon.memory() < memory + 20e6
 
 
-def test_runs_side_by_side_share_the_cores_fairly_and_keep_their_bits(fresh):
+def ready_seconds(d):
+    """{run: how long its thread has had a core or waited for one}, by the kernel (its sched-stats.txt: schedstat)."""
+    ready = {}
+    for task in pathlib.Path(f"/proc/{d.process.pid}/task").iterdir():
+        name = (task / "comm").read_text()
+        if name.startswith("run "):
+            on_core, in_line, _ = map(int, (task / "schedstat").read_text().split())
+            ready[name[4:].strip()] = 1e-9 * (on_core + in_line)
+    return ready
+
+
+def test_runs_side_by_side_do_not_wait_for_each_other_and_keep_their_bits(fresh):
     """More threads than cores where there are two or three; each run ends as when it is alone."""
     d = fresh(slots=4, threads=1).start()
     scene = water(time={"end": 12}, output={"interval": 2})
@@ -186,10 +198,10 @@ def test_runs_side_by_side_share_the_cores_fairly_and_keep_their_bits(fresh):
     d.wait("alone", "completed")
     runs = [d.create(scene, id=f"r{k}")["id"] for k in range(4)]
     until(lambda: max(d.run(run)["step"] for run in runs) >= 10000)
-    steps = [d.run(run)["step"] for run in runs]
-    # Equal threads get equal shares of the kernel, once they have run for many of its time slices (250 steps are only
-    # one to three of them). The worst that it may do for long on two cores is three of the four on one: a third.
-    assert min(steps) > max(steps) / 4, steps
+    # What each gets of the cores is the kernel's, and on a machine that is not ours alone it is anything. Ours is that
+    # none waits for another: each was ready as long as the others, on a core or in the line for one.
+    ready = {run: seconds for run, seconds in ready_seconds(d).items() if run in runs}
+    assert sorted(ready) == sorted(runs) and min(ready.values()) > max(ready.values()) / 2, ready
     for run in runs:
         d.wait(run, "completed")
         assert [f["step"] for f in d.frames(run)] == [f["step"] for f in d.frames("alone")]

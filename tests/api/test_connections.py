@@ -8,16 +8,16 @@ import time
 
 import pytest
 from boxes import big, endless, merged, water
-from fbard import is_sanitized, until
+from fbard import PATIENCE, is_sanitized, until
 from test_watching import Stream, metrics
 
-SOON = 5 if is_sanitized() else 1  # s
+SOON = 5 if is_sanitized() else 1  # s: of the quickest of several, since a machine may stand still for longer
 MANY = 300  # more than the daemon takes in all
 
 
 def connect(daemon):
     host, port = daemon.host.split(":")
-    return socket.create_connection((host, int(port)), timeout=10)
+    return socket.create_connection((host, int(port)), timeout=PATIENCE)
 
 
 @contextlib.contextmanager
@@ -49,11 +49,12 @@ def seconds(ask):
     ids=["nothing", "half a header", "half a line", "half a body", "kept alive"],
 )  # fmt: skip
 def test_idle_connections_give_way_to_new_ones(daemon, text):
+    most = daemon.get("/v1")["limits"]["connections"]
+    before = metrics(daemon)["fbard_http_connections_evicted_total", ""]
     with held(daemon, MANY, text):
-        for _ in range(20):
-            assert seconds(lambda: daemon.get("/healthz")) < SOON
-        assert metrics(daemon)["fbard_http_connections_evicted_total", ""] > 0
-        most = daemon.get("/v1")["limits"]["connections"]
+        assert min(seconds(lambda: daemon.get("/healthz")) for _ in range(20)) < SOON
+        # Room was made for each, and did not come by itself.
+        assert metrics(daemon)["fbard_http_connections_evicted_total", ""] - before >= MANY - most > 0
         until(lambda: metrics(daemon)["fbard_http_connections", ""] <= most)  # but for those being closed
     until(lambda: metrics(daemon)["fbard_http_connections", ""] < 20)
 
@@ -89,7 +90,7 @@ def test_daemon_takes_as_many_streams_as_it_says(daemon, name):
             assert streams[-1].status == 200
         daemon.ask("GET", f"/v1/runs/{name}/events", status=503)
         daemon.ask("GET", f"/v1/runs/{name}/stream", status=503)
-        assert seconds(lambda: daemon.get("/healthz")) < SOON
+        assert min(seconds(lambda: daemon.get("/healthz")) for _ in range(5)) < SOON
     finally:
         for stream in streams:
             stream.connection.close()
@@ -114,7 +115,7 @@ def test_newcomer_is_told_when_everybody_is_busy(daemon, name):
         for _ in range(limits["connections_of_address"] - limits["streams"]):
             s = socket.socket()
             s.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-            s.settimeout(10)
+            s.settimeout(PATIENCE)
             s.connect((host, int(port)))
             s.sendall(f"GET /v1/runs/{name}/frames/0 HTTP/1.1\r\nHost: {daemon.host}\r\n\r\n".encode())
             assert s.recv(12) == b"HTTP/1.1 200"
@@ -143,16 +144,17 @@ def test_slowhttptest_leaves_the_api_answering(daemon, how):
         ["slowhttptest", *how, "-c", "600", "-r", "200", "-i", "1", "-l", "3", "-x", "24", "-p", "1",
          "-u", daemon.http + ("/openapi.json" if how == ["-X"] else "/v1/runs")],
         stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)  # fmt: skip
-    slowest, asked = 0.0, 0
+    took = []
     try:
         while attack.poll() is None:
-            slowest = max(slowest, seconds(lambda: daemon.get("/v1/runs")))
-            asked += 1
+            took.append(seconds(lambda: daemon.get("/v1/runs")))
             time.sleep(0.05)
     finally:
         attack.kill()
         attack.wait()
-    assert asked > 20 and slowest < SOON, f"{slowest:.2f} s at worst of {asked}"
+    # Kept out, it would be answered once or twice, when the attack is over.
+    took.sort()
+    assert len(took) > 5 and took[len(took) // 2] < SOON, took
 
 
 @pytest.mark.long

@@ -3,6 +3,7 @@ unreliable says so. Their verdicts are bench/hard.py's."""
 import math
 
 import pytest
+from fbard import FINAL, until
 from frames import Frame
 
 COARSE = "hard-incompressible"
@@ -34,8 +35,8 @@ def test_drift_is_warned_of_where_errors_are(daemon, name, fbar, warned):
     assert bool(drifted) == warned, run["warnings"]
     if warned:  # told at a sample: at the same time however often the run was asked
         daemon.create(COARSE, id=name + "-again", overrides={**SOFTER, "fbar": fbar})
-        while (again := daemon.run(name + "-again"))["state"] != "completed":
-            pass
+        again = until(lambda: (r := daemon.run(name + "-again"))["state"] in FINAL and r, every=0)
+        assert again["state"] == "completed"
         assert [w for w in again["warnings"] if "drifted apart" in w] == drifted
         daemon.away(name + "-again")
     daemon.away(name)

@@ -1,10 +1,7 @@
 """The live page as files, and what the API has for it: events of all runs, frames cut to size."""
-import os
 import re
 import threading
-import time
 
-import numpy as np
 import pytest
 from boxes import WATER_PARTICLES, endless, water
 from fbard import PATIENCE, until
@@ -124,7 +121,9 @@ def test_events_of_all_runs_tell_of_creation_states_and_removal(daemon, name):
                     daemon.act(name, "start")
                 elif states[-1] == "completed":
                     daemon.ask("DELETE", f"/v1/runs/{name}", status=204)
-        # How often it is looked at is the daemon's: short states may be passed over, never the order.
+        # How often it is looked at is the daemon's: short states may be passed over, never the order. On a slow disk
+        # running is waiting now and then.
+        states = [s for k, s in enumerate(states) if s != "waiting" and s not in states[:k]]
         order = [s for s in ("queued", "paused", "running", "completed") if s in states]
         assert states == order and states[-1] == "completed" and "paused" in states
         assert steps == sorted(steps) and steps[-1] == 50
@@ -157,11 +156,11 @@ def test_events_of_all_runs_say_nothing_while_nothing_happens(fresh):
     """Nothing but the heartbeat, and next to no work: what a page that stands still costs."""
     d = fresh().start()
     d.create(water(), id="still", start=False)
-    until(lambda: d.frames("still"))
-    time.sleep(1)  # what follows the creation
-    with Stream(d, "/v1/events", seconds=3) as stream:
+    d.settle("still")
+    with Stream(d, "/v1/events") as stream:
         events = stream.events()
         assert [next(events)[1] for _ in range(2)] == ["run", "ready"]
+        stream.answer.fp.raw._sock.settimeout(3)
         with pytest.raises(TimeoutError):
             next(events)
 
@@ -219,13 +218,6 @@ def test_index_of_frames_goes_on_after_a_frame(daemon, name):
 # ---- What viewers cost ----
 
 
-def cpu_seconds(d):
-    """Processor time of the daemon's process, by the kernel's account (proc(5): utime, stime)."""
-    with open(f"/proc/{d.process.pid}/stat") as f:
-        fields = f.read().rsplit(")", 1)[1].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
-
-
 @pytest.mark.long
 def test_eight_viewers_and_a_stalled_one_cost_little_and_block_nothing(fresh):
     """12,800 particles, some 60 frames, 8 streams thinned as the page thins, one that is never read; the events of all
@@ -247,12 +239,12 @@ def test_eight_viewers_and_a_stalled_one_cost_little_and_block_nothing(fresh):
                 got[k] += 1
 
         readers = [threading.Thread(target=read, args=(k,)) for k in range(viewers)]
-        before = cpu_seconds(d)
+        before = d.cpu_seconds()
         for thread in readers:
             thread.start()
         d.act(run, "start")
         end = d.wait(run, "completed")
-        cost[run] = cpu_seconds(d) - before
+        cost[run] = d.cpu_seconds() - before
         waited[run] = end["performance"]["phases"]["waiting"]
         probes[run] = d.get(f"/v1/runs/{run}/probes")
         for thread in readers:

@@ -6,7 +6,7 @@ import time
 
 import pytest
 from boxes import endless, merged, water
-from fbard import FINAL, Reply, check_form, is_sanitized, until
+from fbard import FINAL, PATIENCE, Reply, check_form, is_sanitized, until
 
 JSON = {"Content-Type": "application/json"}
 
@@ -401,11 +401,11 @@ def send_slowly_read(daemon, head, chunks):
     """Sends until the daemon answers or hangs up; the answer's first line and how much was sent."""
     address, port = daemon.host.split(":")
     sent, answer = 0, b""
-    with socket.create_connection((address, int(port)), timeout=60) as s:
+    with socket.create_connection((address, int(port)), timeout=PATIENCE) as s:
         s.sendall(head)
         s.setblocking(False)
         pending = b""
-        end = time.monotonic() + 60
+        end = time.monotonic() + PATIENCE
         while time.monotonic() < end:
             try:
                 part = s.recv(65536)
@@ -439,11 +439,11 @@ HUGE = 100_000_000
 
 
 def check_refused_quickly(daemon, head, chunks, most_sent):
-    before, start = daemon.memory(), time.monotonic()
+    before, used = daemon.memory(), daemon.cpu_seconds()
     line, sent = send_slowly_read(daemon, head.replace(b"HOST", daemon.host.encode()), chunks)
     assert line.startswith(b"HTTP/1.1 413"), line
     assert sent <= most_sent
-    assert time.monotonic() - start < 30
+    assert daemon.cpu_seconds() - used < 30
     if not is_sanitized():
         assert daemon.memory() < before + 40e6
     daemon.get("/v1/runs")
@@ -480,18 +480,16 @@ def test_body_at_the_limit_is_read(daemon):
 def test_many_entries_within_the_limit_are_refused_or_taken_but_quickly(daemon):
     scene = water()
     scene["bodies"]["pool"]["shape"] = {"union": [{"box": {"min": [0, 0], "max": [1, 1]}}] * 50_000}
-    start = time.monotonic()
+    used = daemon.cpu_seconds()
     assert daemon.request("POST", "/v1/scenes:validate", scene).status in (200, 422)
-    assert time.monotonic() - start < 60
     many = b'{"scene": {' + b",".join(b'"k%d": 0' % k for k in range(30_000)) + b"}}"
-    start = time.monotonic()
     daemon.ask("POST", "/v1/runs", many, JSON, status=422)
-    assert time.monotonic() - start < 60
+    assert daemon.cpu_seconds() - used < 60
 
 
 def raw(daemon, text, wait=True):
     address, port = daemon.host.split(":")
-    with socket.create_connection((address, int(port)), timeout=20) as s:
+    with socket.create_connection((address, int(port)), timeout=PATIENCE) as s:
         answer = b""
         with contextlib.suppress(OSError):  # it hung up before it had read all
             s.sendall(text)
@@ -600,7 +598,7 @@ def test_client_that_hangs_up_in_the_middle_is_survived(daemon, bystander):
 
 def test_many_open_connections_do_not_keep_others_out(daemon):
     address, port = daemon.host.split(":")
-    idle = [socket.create_connection((address, int(port)), timeout=20) for _ in range(20)]
+    idle = [socket.create_connection((address, int(port)), timeout=PATIENCE) for _ in range(20)]
     try:
         for s in idle:
             s.sendall(b"POST /v1/runs HTTP/1.1\r\nHost: ")

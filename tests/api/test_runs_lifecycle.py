@@ -79,7 +79,7 @@ def test_create_takes_dots_dashes_and_underscores(daemon, name):
 
 def test_create_starts_by_itself_and_completes(daemon, name):
     created = daemon.create(water(), id=name)
-    assert created["state"] in ("queued", "running", "completed")
+    assert created["state"] in ("queued", "running", "waiting", "completed")
     run = check_run(daemon.wait(name, "completed"))
     assert run["step"] == WATER_STEPS
     assert run["time"] == pytest.approx(0.1, rel=1e-12)
@@ -332,14 +332,13 @@ def test_wall_time_stands_still_while_paused(daemon, name):
     assert daemon.run(name)["performance"]["wall_s"] == wall
     daemon.act(name, "resume")
     until(lambda: daemon.run(name)["performance"]["wall_s"] > wall)
-    assert daemon.act(name, "pause")["performance"]["wall_s"] < wall + 60
     daemon.away(name)
 
 
 def test_a_kept_run_object_is_told_only_while_nothing_has_changed(daemon, name):
     path, recorder = f"/v1/runs/{name}", f"/v1/runs/{name}/recorders/somebody"
     daemon.create(endless(), id=name, start=False)
-    daemon.wait(name, "paused")
+    daemon.settle(name)
     seen = daemon.get(path)
     assert daemon.get(path) == seen == next(r for r in daemon.get("/v1/runs")["runs"] if r["id"] == name)
     daemon.ask("PUT", recorder, {"acked": -1})
@@ -349,7 +348,7 @@ def test_a_kept_run_object_is_told_only_while_nothing_has_changed(daemon, name):
     daemon.patch(name, {"time": {"end": 50}})
     changed = daemon.get(path)
     assert (changed["revision"], changed["end_time"], len(changed["changes"])) == (1, 50, 1)
-    for step in range(1, 6):  # each with a frame
+    for step in range(1, 6):
         daemon.act(name, "step", {"steps": 1})
         now = until(lambda: (r := daemon.get(path))["step"] == step and r["state"] == "paused" and r)
         assert daemon.get(path) == now

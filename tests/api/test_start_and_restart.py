@@ -18,13 +18,14 @@ import warnings
 
 import pytest
 from boxes import big, endless, merged, water
-from fbard import PROGRAM, Daemon, fbar_is_on, is_sanitized, until
+from fbard import PATIENCE, PROGRAM, Daemon, fbar_is_on, is_sanitized, until
 from frames import Frame
+from test_watching import metrics
 
 
 def launch(*options, **more):
     """Runs a daemon that is not expected to stay."""
-    return subprocess.run([PROGRAM, *map(str, options)], capture_output=True, text=True, timeout=60, **more)
+    return subprocess.run([PROGRAM, *map(str, options)], capture_output=True, text=True, timeout=PATIENCE, **more)
 
 
 def refused(*options, code=None, **more):
@@ -89,7 +90,7 @@ def test_port_file_has_both_addresses_and_they_answer(daemon):
     assert re.fullmatch(r"tcp://127\.0\.0\.1:\d+", ports["publish"])
     assert daemon.ask("GET", "/healthz").status == 200
     assert daemon.ask("GET", "/readyz").status == 200
-    with socket.create_connection(("127.0.0.1", int(ports["publish"].rsplit(":", 1)[1])), timeout=20):
+    with socket.create_connection(("127.0.0.1", int(ports["publish"].rsplit(":", 1)[1])), timeout=PATIENCE):
         pass
     assert [p.name for p in daemon.folder.iterdir() if p.name.startswith("ports")] == ["ports.json"]
 
@@ -237,7 +238,7 @@ def test_tls_serves_https(tmp_path):
         assert d.http.startswith("https://127.0.0.1:")
         context = ssl.create_default_context(cafile=str(cert))
         context.check_hostname = False
-        connection = http.client.HTTPSConnection(d.host, timeout=60, context=context)
+        connection = http.client.HTTPSConnection(d.host, timeout=PATIENCE, context=context)
         connection.request("GET", "/v1/runs")
         answer = connection.getresponse()
         assert (answer.status, json.loads(answer.read())) == (200, {"runs": []})
@@ -251,7 +252,7 @@ def test_tls_serves_https(tmp_path):
                 warnings.simplefilter("ignore", DeprecationWarning)
                 context.minimum_version = context.maximum_version = version
             host, port = d.host.split(":")
-            with socket.create_connection((host, int(port)), timeout=60) as plain:
+            with socket.create_connection((host, int(port)), timeout=PATIENCE) as plain:
                 if taken:
                     context.wrap_socket(plain).close()
                 else:
@@ -393,17 +394,32 @@ def check_same(d, reference):
     assert not fbar_is_on(d.run("survivor"))
 
 
+def in_motion(d, reach, end):
+    """Begins the run, waits until it has come as far as `reach` does, and ends the daemon while the run is in motion: one
+    that was over before, because all but the daemon stood still meanwhile, is made once more. What `reach` gave."""
+    for _ in range(20):
+        begin(d)
+        reached = reach()
+        end()
+        if not d.was_over("survivor"):
+            return reached
+        d.start()
+        d.away("survivor")
+    raise AssertionError("too quick a machine: it is over each time")
+
+
 @pytest.mark.parametrize("checkpoint", [False, True], ids=["from_the_start", "from_a_checkpoint"])
 def test_killed_run_continues_to_the_same_end(fresh, reference, checkpoint):
     d = fresh().start()
-    begin(d)
-    d.wait_step("survivor", 1500)
-    if checkpoint:
-        d.act("survivor", "checkpoint")
-    d.wait_step("survivor", 2500)
-    before = [d.frame("survivor", f["seq"]) for f in d.frames("survivor")]
-    assert d.run("survivor")["state"] == "running", "too quick a machine: it is over"
-    d.kill()
+
+    def reach():
+        d.wait_step("survivor", 1500)
+        if checkpoint:
+            d.request("POST", "/v1/runs/survivor:checkpoint")
+        d.wait_step("survivor", 2500)
+        return [d.frame("survivor", f["seq"]) for f in d.frames("survivor")]
+
+    before = in_motion(d, reach, d.kill)
     d.start()
     after = [d.frame("survivor", k) for k in range(len(before))]
     assert after == before, "a frame once published never changes"
@@ -422,12 +438,10 @@ def test_killed_again_and_again_it_still_comes_to_the_same_end(fresh, reference)
 
 def test_stopped_run_continues_to_the_same_end(fresh, reference):
     d = fresh().start()
-    begin(d)
-    step = d.wait_step("survivor", 2000)["step"]
-    d.stop()
+    step = in_motion(d, lambda: d.wait_step("survivor", 2000)["step"], d.stop)
     d.start()
     run = d.run("survivor")
-    assert run["state"] in ("queued", "running")
+    assert run["state"] in ("queued", "running", "waiting", "completed")
     assert run["step"] >= step, "it was checkpointed"
     check_same(d, reference)
 
@@ -491,9 +505,10 @@ def test_kills_amid_creation_and_deletion_leave_what_was_answered(fresh):
     """What was answered with 201 is there, what was answered with 204 is not, and nothing is half there."""
     d = fresh("--queue", "5000").start()
     crowd, random_ = Crowd(d), random.Random(int(os.environ.get("FBARD_SEED", 3)))
-    for _ in range(40 if os.environ.get("FBARD_LONG") else 4):
+    for rounds in range(1, 1 + (40 if os.environ.get("FBARD_LONG") else 4)):
         with concurrent.futures.ThreadPoolExecutor(6) as pool:
             clients = [pool.submit(crowd.work, random_.random()) for _ in range(6)]
+            until(lambda: crowd.count > 5 * rounds and crowd.gone)  # some were made, and one is gone for sure
             time.sleep(random_.uniform(0.05, 0.5))
             d.kill()
             for client in clients:
@@ -507,7 +522,6 @@ def test_kills_amid_creation_and_deletion_leave_what_was_answered(fresh):
         for name in crowd.unanswered:
             (crowd.there if name in runs else crowd.gone).add(name)
         crowd.unanswered.clear()
-    assert crowd.count > 10 and crowd.gone
 
 
 def test_resume_paused_and_off_leave_runs_paused(fresh):
@@ -617,16 +631,13 @@ def test_nothing_is_removed_through_a_link_in_the_data_folder(fresh, tmp_path):
 
 def test_torn_tails_are_cut(fresh, reference):
     d = fresh().start()
-    begin(d)
-    d.wait_step("survivor", 2000)
-    d.kill()
+    in_motion(d, lambda: d.wait_step("survivor", 2000), d.kill)
     folder = d.data / "runs" / "survivor"
     for path in folder.rglob("*"):
         if path.is_file() and (path.suffix in (".jsonl", ".log") or "frame" in path.name):
             with open(path, "ab") as f:
                 f.write(b'{"event": "sta')
     d.start()
-    until(lambda: d.run("survivor")["state"] in ("running", "queued", "completed", "failed"))
     check_same(d, reference)
 
 
@@ -638,8 +649,12 @@ def test_a_full_disk_is_warned_of_while_it_is_full(tmp_path):
         d = Daemon(tmp_path).start()
         try:
             scene = water(output={"interval": 1e-3}, bodies={"pool": {"particles_per_cell": 100}})
-            d.create(scene, id="waits")
-            d.create(merged(scene, {"output": {"when_full": "fail"}}), id="fails")
+            d.create(scene, id="waits", start=False)
+            d.create(merged(scene, {"output": {"when_full": "fail"}}), id="fails", start=False)
+            for run in ("waits", "fails"):  # both are there before either fills the disk
+                d.settle(run)
+            for run in ("waits", "fails"):
+                d.act(run, "start")
             error = d.wait("fails", "failed")["error"]
             assert error["kind"] == "journal" and error["quantity"] is None
             d.wait("waits", "waiting")
@@ -709,10 +724,10 @@ def test_runs_that_are_over_hold_no_files_and_no_threads(fresh):
         d.create(TINY, id=run)
         d.wait(run, "completed")
     until(lambda: d.descriptors() < 20)
-    assert stacks(d) < 30, "70 threads have ended; glibc keeps some stacks for the next"
+    until(lambda: stacks(d) < 30)  # 70 threads have ended; glibc keeps some stacks for the next
     d.stop()
     d.start()
-    assert d.descriptors() < 20
+    until(lambda: d.descriptors() < 20)
     for run in runs:
         now = d.run(run)
         assert now["state"] == "completed" and now["journal"]["frames"] == 3, now
@@ -727,12 +742,15 @@ def test_few_descriptors_are_no_way_to_lock_others_out(fresh):
     assert d.get("/v1")["limits"]["connections"] <= 16
     run = d.create(endless())["id"]
     host, port = d.host.split(":")
-    idle = [socket.create_connection((host, int(port)), timeout=20) for _ in range(100)]
+    idle = [socket.create_connection((host, int(port)), timeout=PATIENCE) for _ in range(100)]
     try:
+        took = []
         for _ in range(10):
             began = time.monotonic()
             d.act(run, "checkpoint")
-            assert time.monotonic() - began < (5 if is_sanitized() else 1)
+            took.append(time.monotonic() - began)
+        assert min(took) < (5 if is_sanitized() else 1), took  # the disk and the machine may be slow, but not each time
+        assert metrics(d)["fbard_http_connections_evicted_total", ""] > 80
     finally:
         for s in idle:
             s.close()

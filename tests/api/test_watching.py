@@ -5,6 +5,7 @@ import json
 import os
 import pathlib
 import re
+import select
 import shutil
 import socket
 import struct
@@ -12,10 +13,9 @@ import subprocess
 import threading
 import time
 
-import numpy as np
 import pytest
 from boxes import WATER_PARTICLES, big, endless, water
-from fbard import FINAL, PATIENCE, is_sanitized, strict_json, until
+from fbard import FINAL, PATIENCE, strict_json, until
 from frames import Frame, picked
 
 
@@ -65,6 +65,15 @@ class Stream:
             yield preamble + rest
 
 
+def without_waits(states):
+    """States in their order: a run whose frames have to wait for the disk tells of it, and that it goes on."""
+    kept = []
+    for state in states:
+        if state != "waiting" and kept[-1:] != [state]:
+            kept.append(state)
+    return kept
+
+
 # ---- Events ----
 
 
@@ -81,7 +90,7 @@ def test_events_tell_the_life_of_a_run(daemon, name):
     kinds = [k for _, k, _ in rest]
     assert kinds[-1] == "end" and rest[-1][2]["state"] == "completed"
     states = [d["state"] for _, k, d in rest if k == "state"]
-    assert states == ["running", "completed"]
+    assert without_waits(states) == ["running", "completed"]
     ((number, _, change),) = [e for e in rest if e[1] == "config"]
     assert (number, change["patch"], change["step"]) == ("2", {"fbar": False, "damping": {"mass": 0.5}}, 0)
     ids = [int(i) for i, _, _ in rest if i is not None]
@@ -105,7 +114,8 @@ def test_events_are_replayed_from_any_of_them(daemon, name):
 
     everything = logged(**{"Last-Event-ID": "0"})
     assert [int(e[0]) for e in everything] == list(range(1, len(everything) + 1))
-    assert [e[1] for e in everything] == ["state"] + ["config"] * 5 + ["state", "state"]
+    assert [e[1] for e in everything[:6]] == ["state"] + ["config"] * 5
+    assert without_waits(e[2]["state"] for e in everything[6:] if e[1] == "state") == ["running", "completed"]
     assert "check" not in json.dumps(everything), "the file's own"
     for k in range(len(everything) + 2):
         assert logged(**{"Last-Event-ID": str(k)}) == everything[k:]
@@ -145,7 +155,7 @@ def test_events_of_a_daemon_that_stops_end_and_say_so(fresh, name):
         list(frames.frames())
         ending.join()
     assert events[-1][1:] == ("end", {"event": "end", "state": "running", "reason": "stopping"})
-    assert time.monotonic() - began < (60 if is_sanitized() else 10)
+    assert time.monotonic() - began < 29  # before idle connections are closed
 
 
 @pytest.mark.parametrize("bad", ["x", "-1", "1.5", "", "1e3", "99999999999999999999"])
@@ -159,21 +169,27 @@ def test_events_after_no_event_are_refused(daemon, name, bad):
 
 def test_readers_that_hang_up_are_noticed_while_nothing_happens(daemon, name):
     daemon.create(endless(), id=name, start=False)
-    until(lambda: daemon.frames(name))
+    daemon.settle(name)
 
     def open_now():
         return metrics(daemon)[("fbard_streams", "")]
 
-    before = open_now()
+    until(lambda: open_now() == 0)  # those of other tests are noticed, too
     streams = [Stream(daemon, f"/v1/runs/{name}/{kind}") for kind in ("events", "stream") * 4]
     for stream in streams:
         stream.answer.read(10)
-    assert open_now() == before + 8
+    stays = Stream(daemon, f"/v1/runs/{name}/events")
+    assert [next(stays.events())[1] for _ in range(2)] == ["state", "progress"]
+    assert open_now() == 9
     for stream in streams:
         stream.connection.sock and stream.connection.sock.close()
         stream.answer.close()
         stream.connection.close()
-    until(lambda: open_now() == before, 10)
+    until(lambda: open_now() == 1)
+    # Sooner than something had to be sent to them: the one that was opened last has not been told that it is still here.
+    assert select.select([stays.answer.fp.raw._sock], [], [], 0)[0] == []
+    stays.connection.close()
+    stays.answer.close()
     daemon.away(name)
 
 
@@ -246,18 +262,19 @@ def test_stream_thinned_to_nonsense_is_refused(daemon, name, bad):
 
 
 def test_run_does_not_wait_for_readers_of_streams(daemon, name):
-    """Readers that never read: the run goes on, at its speed."""
+    """Readers that never read: the run goes on, and waits for none of them."""
     def seconds(run):
-        return daemon.wait(run, "completed")["performance"]["wall_s"]
+        performance = daemon.wait(run, "completed")["performance"]
+        return performance["wall_s"], performance["phases"]["waiting"]
 
     scene = water(time={"end": 0.5}, output={"interval": 0.001})
     daemon.create(scene, id=name)
-    alone = seconds(name)
+    alone, _ = seconds(name)
     daemon.create(scene, id=name + "x", start=False)
     until(lambda: daemon.frames(name + "x"))
     streams = [Stream(daemon, f"/v1/runs/{name}x/stream") for _ in range(6)]
     daemon.act(name + "x", "start")
-    assert seconds(name + "x") < 3 * alone + 1
+    assert seconds(name + "x")[1] < 2 * alone + 1  # what it waited; how long it takes is also who else uses the cores
     for stream in streams:
         stream.connection.close()
         stream.answer.close()
@@ -278,6 +295,13 @@ def metrics(daemon):
             assert (key, labels or "") not in found, line
             found[key, labels or ""] = float(value)
     return found
+
+
+def two_clocks():
+    """(when the machine started, within how many seconds that is known)."""
+    before = time.time()
+    up = time.clock_gettime(time.CLOCK_BOOTTIME)
+    return before - up, time.time() - before
 
 
 def test_metrics_count_what_was_done(daemon, name):
@@ -304,9 +328,9 @@ def test_metrics_count_what_was_done(daemon, name):
     assert now["fbard_run_step", f'{{run="{name}"}}'] == 35
     assert now["fbard_journal_bytes", ""] > 0 and now["process_resident_memory_bytes", ""] > 1e6
     assert 0 < now["process_open_fds", ""] < now["process_max_fds", ""]
-    up = time.clock_gettime(time.CLOCK_BOOTTIME)
     ticks = int(pathlib.Path(f"/proc/{daemon.process.pid}/stat").read_text().rsplit(") ", 1)[1].split()[19])
-    began = time.time() - up + ticks / os.sysconf("SC_CLK_TCK")
+    booted = min((two_clocks() for _ in range(100)), key=lambda pair: pair[1])[0]
+    began = booted + ticks / os.sysconf("SC_CLK_TCK")
     assert abs(now["process_start_time_seconds", ""] - began) < 1, "by the kernel's clocks"
     assert sum(v for (k, label), v in now.items() if k == "fbard_run_phase_seconds" and name in label) > 0
     daemon.away(name)
@@ -319,7 +343,7 @@ def test_metrics_pass_promtool(daemon, name):
     daemon.create(water(), id=name)
     daemon.ask("PUT", f"/v1/runs/{name}/recorders/me", {"acked": -1})
     text = daemon.ask("GET", "/metrics").body
-    check = subprocess.run(["promtool", "check", "metrics"], input=text, capture_output=True, timeout=60)
+    check = subprocess.run(["promtool", "check", "metrics"], input=text, capture_output=True, timeout=PATIENCE)
     assert (check.returncode, check.stdout + check.stderr) == (0, b"")
     daemon.wait(name, "completed")
     daemon.away(name)
