@@ -5,6 +5,7 @@ import assert from "node:assert/strict";
 import { spawn } from "node:child_process";
 import fs from "node:fs";
 import { createRequire } from "node:module";
+import net from "node:net";
 import os from "node:os";
 import path from "node:path";
 
@@ -24,14 +25,32 @@ export async function until(what, condition) {
   }
 }
 
+// A free port that nobody is given while its daemon is away (tests/ports.py).
+async function fixedPort() {
+  const [low] = fs.readFileSync("/proc/sys/net/ipv4/ip_local_port_range", "utf8").split(/\s+/).map(Number);
+  const from = Math.max(1025, low - 10000);
+  if (low - from < 100) return 0;
+  for (;;) {
+    const server = net.createServer();
+    const port = await new Promise((done) => {
+      server.once("error", () => done(null));
+      server.listen(from + Math.floor(Math.random() * (low - from)), "127.0.0.1", () => done(server.address().port));
+    });
+    if (port === null) continue;
+    await new Promise((done) => server.close(done));
+    return port;
+  }
+}
+
 export class Daemon {
   constructor(...options) {
     this.folder = fs.mkdtempSync(path.join(os.tmpdir(), "fbard-page-"));
     this.options = options;
-    this.address = "127.0.0.1:0";
+    this.address = null;
   }
 
   async start() {
+    this.address ??= `127.0.0.1:${await fixedPort()}`;
     const ports = path.join(this.folder, "ports.json");
     fs.rmSync(ports, { force: true });
     const log = fs.openSync(path.join(this.folder, "log.txt"), "a");
@@ -86,6 +105,7 @@ export class Daemon {
 // Chromium draws by its software renderer, so that machines without graphics do.
 export async function launch() {
   return chromium.launch({
+    timeout: PATIENCE_MS,
     executablePath: process.env.CHROMIUM ?? "/usr/bin/chromium",
     args: [
       "--disable-gpu", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-quic", "--no-first-run",
@@ -103,7 +123,7 @@ export async function open(browser, url, options = {}, script = null) {
   const page = await context.newPage();
   if (script !== null) await page.addInitScript(script);
   page.setDefaultTimeout(PATIENCE_MS);
-  const watch = { page, context, foretold: [], wrong: [], requests: [] };
+  const watch = { page, context, foretold: [], wrong: [], requests: [], pending: new Set() };
   page.on("console", (message) => {
     const text = message.text();
     const isDriver = message.type() === "warning" && text.includes("GL Driver Message"); // of screenshots
@@ -113,11 +133,20 @@ export async function open(browser, url, options = {}, script = null) {
   page.on("pageerror", (error) => watch.wrong.push(error.stack));
   context.on("request", (request) => {
     watch.requests.push(request.url());
+    if (!/\/(events|stream)(\?|$)/.test(request.url())) watch.pending.add(request);
     const from = new URL(request.url());
     if (from.origin !== new URL(url).origin && from.protocol !== "blob:") watch.wrong.push(`request to ${request.url()}`);
   });
+  context.on("response", (response) => watch.pending.delete(response.request()));
+  context.on("requestfailed", (request) => watch.pending.delete(request));
   await page.goto(url);
   return watch;
+}
+
+// Once all that the page has asked for has come (but for what has no end), and what the browser says of it.
+export async function answered(watch) {
+  await until(() => `answers to ${[...watch.pending].map((request) => request.url())}`, () => watch.pending.size === 0);
+  await watch.page.evaluate(() => null);
 }
 
 // What a picture shows: {share} of pixels that are not background, {saturated} of those with a hue,

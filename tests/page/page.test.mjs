@@ -5,7 +5,7 @@ import fs from "node:fs";
 import { after, before, test } from "node:test";
 
 import { table } from "../../server/page/colors.js";
-import { Daemon, launch, look, open, until } from "./harness.mjs";
+import { Daemon, answered, launch, look, open, until } from "./harness.mjs";
 
 let daemon;
 let browser;
@@ -21,12 +21,17 @@ const says = async (selector, pattern) => {
 };
 const particles = (k = 0) => page.locator("canvas.particles").nth(k).screenshot();
 
-// The picture, once it is another one.
-const other = async (than) => {
-  let now;
-  await until("another picture", async () => !(now = await particles()).equals(than));
-  return now;
+// The picture, once it is another one and stays it.
+const other = async (than, shot = particles) => {
+  let last = null;
+  return until("another picture", async () => {
+    const now = await shot();
+    const stays = last !== null && now.equals(last) && (than === null || !now.equals(than));
+    last = now;
+    return stays && now;
+  });
 };
+const settled = (shot = particles) => other(null, shot);
 
 before(async () => {
   daemon = await new Daemon().start();
@@ -52,6 +57,7 @@ function check(name, call) {
     failed = true;
     watch.foretold = [];
     await call();
+    await answered(watch);
     assert.deepEqual(watch.wrong, []);
     failed = false;
   });
@@ -148,11 +154,12 @@ check("a run is created from a built-in scene with overrides", async () => {
 
 check("particles are drawn in the colours of the field", async () => {
   await says(".pane-title", /t = 0\.[0-9]/);
-  const seen = await look(browser, await particles());
   // Water fills a fair part of the view; its pressure rises with the depth, so many colours of the map.
-  assert.ok(seen.share > 0.12, JSON.stringify(seen));
-  assert.ok(seen.colors > 40, JSON.stringify(seen));
-  assert.ok(seen.darkest < 60 && seen.lightest > 200, JSON.stringify(seen));
+  let seen;
+  await until(() => `water in many colours: ${JSON.stringify(seen)}`, async () => {
+    seen = await look(browser, await particles());
+    return seen.share > 0.12 && seen.colors > 40 && seen.darkest < 60 && seen.lightest > 200;
+  });
   assert.match(await text(".legend"), /Mean stress, k?Pa/);
 });
 
@@ -160,7 +167,7 @@ check("another field, range and map are other colours", async () => {
   await page.getByRole("button", { name: "Pause", exact: true }).click(); // so that nothing else changes the picture
   await says("#run-state", /paused/);
   await says("#clock", new RegExp(`frame ${(await daemon.get(`/v1/runs/${RUN}/frames`)).frames.length - 1}$`));
-  const stress = await particles();
+  const stress = await settled();
   await page.getByLabel("Field").selectOption("velocity:size");
   await says(".legend", /Velocity, magnitude, m\/s/);
   const velocity = await other(stress);
@@ -172,7 +179,7 @@ check("another field, range and map are other colours", async () => {
   await page.getByLabel("Range").selectOption("robust");
   await other(fixed);
   const saturated = async () => (await look(browser, await particles())).saturated;
-  assert.ok((await saturated()) > 0.05);
+  await until("colours", async () => (await saturated()) > 0.05);
   await page.getByLabel("Colours").selectOption("grey");
   await until("grey alone", async () => (await saturated()) < 0.002);
   await page.getByLabel("Colours").selectOption("auto");
@@ -213,7 +220,7 @@ check("the slider goes over the frames of the journal", async () => {
   const { frames } = await daemon.get(`/v1/runs/${RUN}/frames`);
   const slider = page.getByRole("slider", { name: "Time" });
   await until("the slider knows all frames", async () => Number(await slider.getAttribute("max")) === frames.length - 1);
-  const last = await particles();
+  const last = await settled();
   await slider.focus();
   await page.keyboard.press("Home");
   await says("#clock", /frame 0$/);
@@ -248,8 +255,7 @@ check("curves are the probes, with the references of the scene", async () => {
   assert.deepEqual(front.sets.find((s) => s.reference).raw.map(({ x, y }) => [x, y]), cited.map((r) => [r.at, r.reference]));
   const energy = (await drawn()).find((c) => c.name === "energy");
   assert.equal(energy.sets.length, Object.keys(probes.probes.energy).length);
-  const picture = await look(browser, await page.locator("figure.curve canvas").first().screenshot());
-  assert.ok(picture.share > 0.005, JSON.stringify(picture));
+  await until("a curve", async () => (await look(browser, await page.locator("figure.curve canvas").first().screenshot())).share > 0.005);
 });
 
 check("picture and CSV are downloaded", async () => {
@@ -269,7 +275,7 @@ check("picture and CSV are downloaded", async () => {
 });
 
 check("the view is turned by hand and keys, and fits again", async () => {
-  const before = await particles();
+  const before = await settled();
   const box = await page.locator("canvas.particles").boundingBox();
   await page.mouse.move(box.x + box.width / 2, box.y + box.height / 2);
   await page.mouse.wheel(0, -400);
@@ -306,9 +312,11 @@ check("two runs stand side by side on one time axis", async () => {
   });
   assert.equal(times.length, 2);
   for (const k of [0, 1]) await until(`particles in pane ${k}`, async () => (await look(browser, await particles(k))).share > 0.08);
-  const legends = await page.locator(".legend").allTextContents();
-  assert.equal(legends[0], legends[1], "one range for both");
-  assert.equal(await page.evaluate(() => window.Chart.getChart(document.querySelector("figure.curve canvas")).data.datasets.filter((d) => !d.isReference).length), 2);
+  await until("one range for both", async () => {
+    const legends = await page.locator(".legend").allTextContents();
+    return legends.length === 2 && legends[0] === legends[1];
+  });
+  await until("curves of both", () => page.evaluate(() => window.Chart.getChart(document.querySelector("figure.curve canvas")).data.datasets.filter((d) => !d.isReference).length === 2));
   await page.getByLabel("Compare with").selectOption("");
   await until("one pane again", async () => (await page.locator(".pane").count()) === 1);
 });
@@ -328,14 +336,17 @@ check("a daemon that is killed is said to be away, and comes back by itself", as
   await until("new frames are shown", async () => Number(/frame (\d+)/.exec(await text("#clock"))?.[1]) >= frames.length);
   await page.getByRole("button", { name: "Pause", exact: true }).click();
   await says("#run-state", /paused/);
-  await page.waitForTimeout(300);
 });
 
 check("a page that stands still asks nothing and costs next to nothing", async () => {
   await says("#runs", /paused.*paused/s);
-  await page.waitForTimeout(1000);
   const streams = async () => Number(/^fbard_streams (\d+)/m.exec(await (await daemon.ask("GET", "/metrics")).text())[1]);
-  assert.equal(await streams(), 1, "the events of all runs, and nothing else");
+  await until("the events of all runs, and nothing else", async () => (await streams()) === 1);
+  await until("what followed the pause is over", async () => {
+    const before = [watch.requests.length, daemon.cpu()];
+    await page.waitForTimeout(500);
+    return watch.requests.length === before[0] && daemon.cpu() - before[1] <= 0.01;
+  });
   const asked = watch.requests.length;
   const cpu = daemon.cpu();
   await page.waitForTimeout(3000);
@@ -427,15 +438,15 @@ test("three dimensions are orbited", async () => {
   const own = await open(browser, `${daemon.url}/#run=solid`);
   const canvas = own.page.locator("canvas.particles");
   await own.page.locator(".pane-title b").waitFor();
-  let before;
-  await until("particles", async () => (await look(browser, (before = await canvas.screenshot()))).share > 0.05);
+  const shot = () => canvas.screenshot();
+  await until("particles", async () => (await look(browser, await shot())).share > 0.05);
+  const before = await settled(shot);
   const box = await canvas.boundingBox();
   await own.page.mouse.move(box.x + box.width / 2, box.y + box.height / 2);
   await own.page.mouse.down();
   await own.page.mouse.move(box.x + box.width / 2 + 120, box.y + box.height / 2 + 30);
   await own.page.mouse.up();
-  let turned;
-  await until("another picture", async () => !(turned = await canvas.screenshot()).equals(before));
+  const turned = await other(before, shot);
   assert.ok((await look(browser, turned)).share > 0.05);
   assert.deepEqual(own.wrong, []);
   await own.context.close();
@@ -462,11 +473,12 @@ test("fingers on a phone: one orbits, two pan, a pinch zooms", async () => {
     const [width, label] = [(await own.page.locator(".scale i").boundingBox()).width, await own.page.locator(".scale span").textContent()];
     return { perMetre: width / Number(label.replace(" m", "")), place: (await look(browser, shot)).place };
   };
-  // The view, once it is nearer by `zoom`, and the particles have moved by `by` px (12 for what perspective makes of it).
+  // The view, once it stands still, is nearer by `zoom`, and the particles have moved by `by` px (12 for what perspective makes of it).
   const becomes = (what, from, zoom, by) => {
     let now = null;
     return until(() => `${what}: ${JSON.stringify([from, now])}`, async () => {
       now = await view();
+      if (!shot.equals(await canvas.screenshot())) return false;
       return Math.abs(now.perMetre / from.perMetre / zoom - 1) < 0.02 && by.every((v, d) => v === null || Math.abs(now.place[d] - from.place[d] - v) < 12) && now;
     });
   };
@@ -474,7 +486,7 @@ test("fingers on a phone: one orbits, two pan, a pinch zooms", async () => {
   const top = await scrolled();
   await own.page.locator("#field").selectOption("position:0"); // in all colours
   await own.page.locator(".legend").evaluate((legend) => (legend.style.visibility = "hidden")); // whose colours stay where they are
-  await until("particles", async () => (await view()).place.every((v) => v > 0));
+  await until("particles", async () => (await view()).place.every((v) => v > 0) && shot.equals(await canvas.screenshot()));
   const start = await view();
   const before = shot;
   await slide([[x, y]], [[x + 90, y + 20]]);
