@@ -225,19 +225,32 @@ static struct mpm_sim *create(int which, struct block b) {
 
 // Seconds per particle and step, of steps that take about the time given. A case that fails says
 // so, and gives NaN; the others go on.
-static double timed_by(double (*clock)(void), struct mpm_sim *sim, double seconds) {
+struct turn {
+    double (*clock)(void);
+    struct mpm_sim *sim;
+    double seconds, a_step; // a_step: of them and a particle
+};
+static void take_turn(void *context) {
+    struct turn *turn = context;
     struct mpm_error err = {0};
-    const double n = (double)mpm_n_particles(sim), t = clock();
+    const double t = turn->clock();
     int steps = 0;
     do {
-        if (mpm_step(sim, &err)) {
+        if (mpm_step(turn->sim, &err)) {
             printf("FAILED: %s\n", err.message);
             n_failed++;
-            return NAN;
+            turn->a_step = NAN;
+            return;
         }
         steps++;
-    } while (clock() - t < seconds);
-    return (clock() - t) / n / steps;
+    } while (turn->clock() - t < turn->seconds);
+    turn->a_step = (turn->clock() - t) / (double)mpm_n_particles(turn->sim) / steps;
+}
+// As the daemon runs it: threads stand by between the steps.
+static double timed_by(double (*clock)(void), struct mpm_sim *sim, double seconds) {
+    struct turn turn = {.clock = clock, .sim = sim, .seconds = seconds};
+    mpm_hold(sim, take_turn, &turn);
+    return turn.a_step;
 }
 double timed(struct mpm_sim *sim, double seconds) {
     return timed_by(sim->def->n_threads > 1 ? wall_now : now, sim, seconds);

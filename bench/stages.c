@@ -29,10 +29,10 @@ static const struct {
 
 static void run(pass *work, const struct mpm_sim *sim, struct mpm_span span) {
     const struct mpm_order *order = &sim->orders[0];
-    for (size_t t = 0; t < order->n_tiles; t++) {
-        span.begin = order->tile[t].begin;
-        span.end = order->tile[t].end;
-        span.next = t + 1 < order->n_tiles ? order->tile[t + 1].begin : span.begin;
+    for (size_t t = 0; t < order->n_stretches; t++) {
+        span.begin = order->stretch[t].begin;
+        span.end = order->stretch[t].end;
+        span.next = t + 1 < order->n_stretches ? order->stretch[t + 1].begin : span.begin;
         struct mpm_span_result found;
         work(&span, &found);
     }

@@ -19,6 +19,7 @@
 #define QUEUED_SECONDS 2.0   // between two looks for what a run waits that has no slot
 #define LONELY_SECONDS 0.02  // between two looks whether somebody has come
 #define PUBLISH_SECONDS 0.02 // between two copies of the status
+#define HELD_SECONDS 0.005   // that solver threads stand by before the state is looked at again
 #define WAITING_SECONDS 0.25 // a shorter wait for the disk is not worth a change of state
 #define CHECKPOINT_FLUSH 5.0 // s to wait for frames on their way before a checkpoint is given up
 
@@ -457,6 +458,17 @@ static void advance(struct run *r) {
         run_checkpoint(r, why);
 }
 
+// Goes on while nothing else is to be done, for some milliseconds. What ends a run is left to the
+// next turn, which may free the simulation.
+static void advance_for_a_while(void *context) {
+    struct run *r = context;
+    const double since = run_clock();
+    do
+        advance(r);
+    while (r->now.state == RUN_RUNNING && r->ending == RUN_N_STATES && !r->due &&
+           !atomic_load(&r->knock) && !atomic_load(&r->stop) && run_clock() - since < HELD_SECONDS);
+}
+
 // Whether the run still waits for those who are to see its first frame. What it has of memory it
 // keeps meanwhile, and its slot.
 static bool is_lonely(struct run *r) {
@@ -534,7 +546,7 @@ static void turn(struct run *r) {
         advance(r);
         break;
     case RUN_RUNNING:
-        advance(r);
+        mpm_hold(r->sim, advance_for_a_while, r);
         break;
     case RUN_PAUSED:
         if (r->wants_sim) {

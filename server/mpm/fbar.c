@@ -9,7 +9,7 @@ int mpm_fbar_scalars(enum mpm_fbar_scheme scheme) {
     return scheme == MPM_FBAR_OFF ? 0 : scheme == MPM_FBAR_ZHAO ? 1 : 2;
 }
 
-void mpm_fbar_divide(struct mpm_grid *grid, uint32_t begin, uint32_t end) {
+void mpm_fbar_divide(const struct mpm_grid *grid, uint32_t begin, uint32_t end) {
     const size_t scalars = (size_t)grid->fbar_stride, nodes = (size_t)MPM_BLOCK_NODES(grid->dim);
     const size_t volume = (size_t)MPM_NODE_VOLUME(grid->dim);
     for (size_t i = begin * nodes; i < end * nodes; i++) {

@@ -5,9 +5,8 @@
 
 // Sums besides V that a scheme averages: 0, 1 or 2.
 int mpm_fbar_scalars(enum mpm_fbar_scheme scheme);
-// Between scatter and finish, once walls have folded: sums become averages, in the grid's slots
-// [begin, end); a node without volume stays out.
-void mpm_fbar_divide(struct mpm_grid *grid, uint32_t begin, uint32_t end);
+// The plain kernel divide_nodes (transfer.h).
+void mpm_fbar_divide(const struct mpm_grid *grid, uint32_t begin, uint32_t end);
 // max |ln(J/Jbar)| over the particles of one body: how far the volume that forces use (or, for a
 // fluid under F-bar, its raw volume ratio) has come from the ratio that stress uses. Infinite when
 // a raw ratio is not positive.

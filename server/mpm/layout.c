@@ -4,13 +4,13 @@
 
 #include "server/mpm/sim.h"
 
-// Blocks, walls and colours from the tiles.
+// Blocks, walls and stretches from the tiles.
 static bool lay_out(struct mpm_sim *sim) {
     const enum mpm_basis basis = sim->def->basis;
     mpm_grid_deactivate(&sim->grid);
     sim->n_shared = 0;
     for (size_t b = 0; b < sim->n_sets; b++) {
-        if (!mpm_order_colour(&sim->orders[b], &sim->grid, basis) ||
+        if (!mpm_order_stretches(&sim->orders[b], &sim->grid, basis, sim->def->n_threads) ||
             !mpm_order_activate(&sim->orders[b], &sim->grid, basis)) {
             return false;
         }

@@ -1,5 +1,5 @@
-// Memory of the large arrays: the kernels go through a dozen of them at a time, tile by tile, which
-// takes more pages of 4 kB than a processor's first table of translations has places for.
+// Memory of the large arrays: the kernels go through a dozen of them at a time, stretch by stretch,
+// which takes more pages of 4 kB than a processor's first table of translations has places for.
 #include "server/mpm/memory.h"
 
 #include <stdint.h>

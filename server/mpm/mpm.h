@@ -349,9 +349,9 @@ struct mpm_def {
     bool
         wants_volume_ratio; // a frame will ask for the raw volume ratio, also of fluids under F-bar
     bool wants_mean_stress_smooth; // a frame will ask for it; counted in the estimate of memory
-    size_t memory_limit;    // bytes, 0 = none
-    int n_threads;          // >= 1; results do not depend on it
-    enum mpm_isa isa;       // of the kernels; another one changes results by round-off only
+    size_t memory_limit;           // bytes, 0 = none
+    int n_threads;                 // >= 1; results do not depend on it
+    enum mpm_isa isa;              // of the kernels; another one changes results by round-off only
     // Wall-clock seconds, to time the phases; NULL = no timing. Called from the stepping thread
     // only.
     double (*clock)(void);
@@ -390,6 +390,10 @@ void mpm_free(struct mpm_sim *sim);
 // One time step. A failure (see enum mpm_status) names step, time, particle, quantity and value;
 // the simulation must then only be read or freed.
 enum mpm_status mpm_step(struct mpm_sim *sim, struct mpm_error *err);
+// Calls body(context), which takes some steps, with the simulation's threads standing by between
+// them too: to have them come and go takes a small scene some hundredths of a step. They look for
+// the next step some ten microseconds, then sleep. The simulation must not be freed within.
+void mpm_hold(struct mpm_sim *sim, void (*body)(void *context), void *context);
 bool mpm_finished(const struct mpm_sim *sim); // the last stage is over
 
 uint64_t mpm_step_count(const struct mpm_sim *sim); // steps done, all stages

@@ -1,20 +1,20 @@
 // Order of a body's particles: by block of the grid, then by cell (stable, so that equal cells keep
-// their order); and the tiles, which are the units of parallel work.
+// their order); and the stretches, which are the units of parallel work.
 //
 // A tile is the particles of one block at the time of the last sort. Until the next one none of
-// them may drift by a whole cell: then tiles that are two blocks apart (three with cubic B-splines)
-// reach no common node. Tiles have colours, such that those of one colour are so far apart. A tile
-// may add to the grid once those of lower colours near it have: so no two threads add to a node at
-// the same time, and each node's sum has one order, whatever the number of threads. Within a tile a
-// stale order costs speed only: kernels look at each particle's cell.
+// them may drift by a whole cell: then the particles of blocks that are two apart (three with cubic
+// B-splines) reach no common node. Blocks that follow each other along the last direction are a
+// row, and their particles lie one after another; a stretch is some hundred of these, which may
+// begin and end within a block. Of two stretches that reach common nodes one comes before the other
+// (by colour, then by place), and adds to the grid before it: so no two threads add to a node at
+// the same time, and each node's sum has one order, whatever the number of threads. Within a
+// stretch a stale order costs speed only: kernels look at each particle's cell.
 #pragma once
 #include <stdatomic.h>
 
 #include "server/mpm/grid.h"
 #include "server/mpm/particles.h"
 #include "server/mpm/team.h"
-
-#define MPM_MAX_COLOURS 27
 
 struct mpm_tile {
     uint32_t begin, end; // particles
@@ -23,32 +23,43 @@ struct mpm_tile {
     uint64_t cells;      // bits: the cells of the block (place of the first node) in use
 };
 
-#define MPM_APART 16   // numbers, so that each has a cache line of its own
-#define MPM_FEWEST 128 // particles of a chunk, and a sixteenth of the body's up to MPM_MOST
+struct mpm_stretch {
+    uint32_t begin, end;  // particles
+    uint32_t first, last; // the blocks of these, of the grid
+};
+
+#define MPM_APART 16  // numbers, so that what lies between shares no cache line
+#define MPM_FEWEST 64 // particles of a chunk, and 1/32 of the body's up to MPM_MOST
 #define MPM_MOST 512
 
 struct mpm_order {
-    size_t n_tiles, capacity;
+    size_t n_tiles, tile_capacity;
     struct mpm_tile *tile; // by block
-    uint8_t *colour;       // (n_tiles)
+    size_t n_stretches, capacity;
+    struct mpm_stretch *stretch; // by row and place
+    // (n_stretches) By which they come before each other. In two of one colour that reach common
+    // nodes the first of them does.
+    uint8_t *colour;
     int n_colours;
-    uint32_t *before_begin, *before; // of tile t [before_begin[t], before_begin[t + 1]) of the
-                                     // tiles near it with lower colours
+    uint32_t *before_begin, *before; // of stretch t [before_begin[t], before_begin[t + 1]) of those
+                                     // near it that come before it
     size_t before_capacity;
-    uint64_t
-        *work_before; // (n_tiles + 1) particles of the tiles before, and what tiles cost besides
-    // Chunks of tiles that follow each other, of so many particles or more: whatever a pass works
-    // by, tiles or chunks, the cuts between the parts fall between the same particles, since to
-    // move a particle from one core's cache to another's takes longer than all else that is done
-    // with it. Never depends on the number of threads: sums go by chunks.
-    uint32_t *chunk; // (n_chunks + 1) first tile of each, and n_tiles
+    uint64_t *work_before; // (n_stretches + 1) particles of those before, and what each costs
+                           // besides
+    // Chunks of stretches that follow each other, of so many particles or more: whatever a pass
+    // works by, the cuts between the parts fall between the same particles, since to move a
+    // particle from one core's cache to another's takes longer than all else that is done with it.
+    // Never depends on the number of threads: sums go by chunks.
+    uint32_t *chunk; // (n_chunks + 1) first stretch of each, and n_stretches
     size_t n_chunks;
-    atomic_uint *done; // (n_tiles, MPM_APART) the pass in which a tile has last been done
+    atomic_uint *done; // (n_stretches + parts * MPM_APART) the pass in which one was last done
+    size_t n_flags;    // room in `done`
     unsigned pass;
-    // The tiles in parts of chunks, each in an order that keeps what they wait for and is near that
-    // of memory.
+    // The stretches in parts of chunks, each in an order that keeps what they wait for and is near
+    // that of memory.
     uint32_t *share;
-    uint8_t *when; // (n_tiles) for sharing out
+    uint32_t *flag; // (n_stretches) where in `done`: a part's side by side, for who waits for many
+    uint8_t *when;  // (n_stretches) for sharing out
 };
 
 // Memory for sorting any body of up to n particles.
@@ -70,12 +81,14 @@ bool mpm_order_reserve(struct mpm_order *order, size_t n);
 // sorted, and the order must not be used.
 bool mpm_order_sort(struct mpm_order *order, struct mpm_particles *s, const struct mpm_grid *grid,
                     enum mpm_basis basis, struct mpm_sorter *sorter);
-// Gives the tiles their colours and finds what they wait for: after they were found or restored.
-// False when memory is short.
-bool mpm_order_colour(struct mpm_order *order, const struct mpm_grid *grid, enum mpm_basis basis);
+// Finds the stretches and what they wait for: after the tiles were found or restored. There is room
+// for n_threads parts. False when memory is short.
+bool mpm_order_stretches(struct mpm_order *order, const struct mpm_grid *grid, enum mpm_basis basis,
+                         int n_threads);
 // The chunk before which there is about a share (0 to 1) of the body's work.
 size_t mpm_order_cut(const struct mpm_order *order, double share);
-// Shares the tiles out in n parts, of which part k begins with chunk parts[k], and n ends the last.
+// Shares the stretches out in n parts, of which part k begins with chunk parts[k], and n ends the
+// last.
 void mpm_order_share(struct mpm_order *order, const uint32_t *parts, int n);
 // Gives every block that particles of the tiles can reach before the next sort its slot. False when
 // memory is short.

@@ -15,6 +15,7 @@
 #include "server/mpm/material.h"
 
 #define MPM_BLOCK 8
+#define MPM_BATCH 64 // particles that kernels in lanes work on at a time
 
 struct mpm_particles {
     size_t n, capacity; // particles; rounded up to whole blocks
@@ -44,7 +45,8 @@ struct mpm_particles {
     double *J_raw; // (n) the unaveraged volume ratio of a fluid, where something asks for it
     double *dx;    // (n, dim) m, displacement of this step, while F-bar is on
     double *dJ;    // (n) det of this step's relative deformation gradient, while F-bar is on
-    const double *smooth; // Pa, by id of all particles, borrowed: what server/mpm/smooth.h found last
+    const double
+        *smooth; // Pa, by id of all particles, borrowed: what server/mpm/smooth.h found last
     void *memory, *fbar_memory; // owned: all of the above; dx and dJ
     size_t memory_bytes, fbar_bytes;
 };

@@ -43,11 +43,13 @@ struct mpm_clockwork {
     uint64_t runs_at_sort, runs; // particles of one cell in a row: after the sort, and now
 };
 
-// Which tile or chunk of a thread's part is next, where the part ends, and what the thread has
+// Which stretch or chunk of a thread's part is next, where the part ends, and what the thread has
 // found; cache lines for each.
 struct mpm_turn {
     _Alignas(128) _Atomic uint64_t next;       // and the end
-    _Alignas(64) struct mpm_span_result found; // but for sums
+    _Alignas(64) struct mpm_span_result found; // in this step, but for sums
+    int fault_pass;                            // if it found a fault: in which pass
+    size_t fault_body;                         // and whose particle's
     // Since the last sort: at work, without waiting, s, and on how many particles, pass by pass.
     double seconds, work;
     double speed, share; // particles a second before that, and its share of all work

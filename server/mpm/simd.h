@@ -314,6 +314,13 @@ typedef double mpm_four __attribute__((vector_size(32)));
 MPM_KERNEL mpm_four mpm_load_four(const double *from) {
     return _mm256_load_pd(from);
 }
+MPM_KERNEL mpm_four mpm_positive_or_one(mpm_four a) {
+    return _mm256_blendv_pd(_mm256_set1_pd(1), a,
+                            _mm256_cmp_pd(a, _mm256_setzero_pd(), _CMP_GT_OQ));
+}
+MPM_KERNEL void mpm_store_four(double *to, mpm_four a) {
+    _mm256_store_pd(to, a);
+}
 // Components of a node (server/mpm/grid.h) in 3D: bits of those that go with the weight, and of
 // those that go with its gradient, the force.
 MPM_KERNEL mpm_word mpm_sums(const int part) {

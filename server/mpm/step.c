@@ -10,8 +10,8 @@
 #define UNSTABLE_CFL                                                                               \
     1.0 // no basis is stable at dt >= 0.9 h/c (docs/method.md): beyond this it is not tried
 
-// Work on nodes. Each thread has the blocks around its part of the tiles, so that most of what it
-// adds to the grid, moves and gathers stays with it: to fetch what another core has just changed
+// Work on nodes. Each thread has the blocks around its part of the particles, so that most of what
+// it adds to the grid, moves and gathers stays with it: to fetch what another core has just changed
 // takes longer than all else that is done with a node.
 struct nodes_work {
     struct mpm_sim *sim;
@@ -69,7 +69,7 @@ static void share_out(struct mpm_sim *sim) {
     for (int k = 1; k < n; k++) {
         const size_t t = order->chunk[parts_of(sim, most)[k]];
         const uint32_t slot =
-            t < order->n_tiles ? sim->grid.slot[order->tile[t].block] : sim->grid.n_slots;
+            t < order->n_stretches ? sim->grid.slot[order->stretch[t].first] : sim->grid.n_slots;
         sim->cut[k] = slot > sim->cut[k - 1] ? slot : sim->cut[k - 1];
     }
     sim->cut[n] = sim->grid.n_slots;
@@ -131,7 +131,10 @@ static void divide_nodes(void *context, int own, int there) {
         }
         mpm_team_barrier(sim->team, there);
     }
-    mpm_fbar_divide(grid, sim->cut[own] > 0 ? sim->cut[own] : 1, sim->cut[own + 1]);
+    const uint32_t first = sim->cut[own] > 0 ? sim->cut[own] : 1, last = sim->cut[own + 1];
+    if (first < last) {
+        sim->kernels->divide_nodes(grid, first, last);
+    }
     clear(sim, grid->node, MPM_NODE, own);
     mpm_walls_mirror_fbar(sim->walls, sim->n_walls, grid, own);
     if (sim->walls_in_common) {
@@ -166,6 +169,8 @@ struct particles_work {
     struct mpm_order *order;
     struct mpm_span span;
     span_work *work;
+    size_t body;
+    int pass;              // of the step, from 0; a body's own
     const uint32_t *parts; // (n_parts + 1) first chunk of each
     int n_parts;           // one a thread
     bool clears_sums;      // which nobody will read any more
@@ -187,7 +192,7 @@ static void work_on(const struct particles_work *w, size_t begin, size_t end, si
 
 #define MUCH 3 // one of so many parts is
 
-// A part's next tile or chunk in the lower half of its turn, the end in the upper one. Its own
+// A part's next stretch or chunk in the lower half of its turn, the end in the upper one. Its own
 // thread sets it as it begins; until then, as at the end of all work, nothing is left.
 static void begin_turn(struct mpm_turn *turn, size_t begin, size_t end) {
     atomic_store_explicit(&turn->next, (uint64_t)end << 32 | begin, memory_order_release);
@@ -211,24 +216,58 @@ static double now_or_zero(const struct mpm_sim *sim) {
     return sim->def->clock ? sim->def->clock() : 0;
 }
 
-// What a thread has found, on how many particles, and since when: for follow_speeds.
-static void end_turn(const struct mpm_sim *sim, int own, const struct mpm_span_result *found,
+// What a thread has found in the step so far, on how many particles, and since when: for
+// follow_speeds. Of faults the first pass' counts.
+static void end_turn(const struct particles_work *w, int own, struct mpm_span_result *found,
                      size_t work, double since) {
-    struct mpm_turn *turn = &sim->turns[own];
-    turn->found = *found;
+    struct mpm_turn *turn = &w->sim->turns[own];
+    if (w->pass == 0) {
+        turn->found = *found;
+        turn->fault_pass = 0;
+        turn->fault_body = w->body;
+    } else {
+        if (turn->found.bad != SIZE_MAX) {
+            found->bad = SIZE_MAX;
+        } else {
+            turn->fault_pass = w->pass;
+            turn->fault_body = w->body;
+        }
+        join(&turn->found, found, w->span.s->dim);
+    }
     if (since > 0) {
         turn->work += (double)work;
-        turn->seconds += now_or_zero(sim) - since;
+        turn->seconds += now_or_zero(w->sim) - since;
     }
 }
 
-// Work that adds to the grid goes tile by tile. A tile waits for those near it with lower colours,
-// so that every node's sum has one order whatever the number of threads (order.h). Each thread does
-// its own part of the tiles first, then what others are far from. Nobody waits for a tile that
-// nobody will do: those that other parts wait for come first and by colour (order.c), so that of
-// all that are being done there, the one with the lowest colour waits for none that is, and a
-// part's next is always done or taken by the one whose part it is.
-static void work_on_tiles(void *context, int own, int there) {
+// What all have found in the step: of faults the first pass' first, by its particle's id.
+static void join_found(const struct mpm_sim *sim, struct mpm_span_result *joined) {
+    int pass = 0;
+    size_t body = 0;
+    for (int k = 0; k < sim->team->n_there; k++) {
+        const struct mpm_turn *turn = &sim->turns[k];
+        struct mpm_span_result found = turn->found;
+        if (found.bad != SIZE_MAX && (joined->bad == SIZE_MAX || turn->fault_pass < pass)) {
+            joined->bad = SIZE_MAX;
+            pass = turn->fault_pass;
+            body = turn->fault_body;
+        } else if (turn->fault_pass > pass) {
+            found.bad = SIZE_MAX;
+        }
+        join(joined, &found, sim->grid.dim);
+    }
+    if (joined->bad != SIZE_MAX) {
+        joined->bad = sim->sets[body].first_id + sim->sets[body].id[joined->bad];
+    }
+}
+
+// Work that adds to the grid goes by stretches. One waits for those near it that come before it, so
+// that every node's sum has one order whatever the number of threads (order.h). Each thread does
+// its own part first, then what others are far from. Nobody waits for one that nobody will do:
+// those that other parts wait for come first and in their order (stretch.c), so that of all that
+// are being done there, the first waits for none that is, and a part's next is always done or taken
+// by the one whose part it is.
+static void work_on_stretches(void *context, int own, int there) {
     const struct particles_work *w = context;
     const struct mpm_order *order = w->order;
     struct mpm_team *team = w->sim->team;
@@ -246,7 +285,7 @@ static void work_on_tiles(void *context, int own, int there) {
             const uint32_t t = order->share[i], next = order->share[i + 1 < end ? i + 1 : i];
             for (uint32_t q = order->before_begin[t]; there > 1 && q < order->before_begin[t + 1];
                  q++) {
-                atomic_uint *done = &order->done[order->before[q] * (size_t)MPM_APART];
+                atomic_uint *done = &order->done[order->flag[order->before[q]]];
                 for (unsigned pass;
                      (pass = atomic_load_explicit(done, memory_order_acquire)) != order->pass;) {
                     const double waits = now_or_zero(w->sim);
@@ -254,27 +293,27 @@ static void work_on_tiles(void *context, int own, int there) {
                     since += now_or_zero(w->sim) - waits;
                 }
             }
-            work_on(w, order->tile[t].begin, order->tile[t].end, order->tile[next].begin, &found,
-                    NULL);
-            work += order->tile[t].end - order->tile[t].begin;
+            work_on(w, order->stretch[t].begin, order->stretch[t].end, order->stretch[next].begin,
+                    &found, NULL);
+            work += order->stretch[t].end - order->stretch[t].begin;
             if (there > 1) {
-                atomic_uint *done = &order->done[t * (size_t)MPM_APART];
+                atomic_uint *done = &order->done[order->flag[t]];
                 atomic_store_explicit(done, order->pass, memory_order_release);
                 mpm_team_tell(team, done);
             }
         }
     }
-    end_turn(w->sim, own, &found, work, since);
+    end_turn(w, own, &found, work, since);
 }
 
-static void for_tiles(struct particles_work *w) {
+static void for_stretches(struct particles_work *w) {
     w->order->pass++;
-    mpm_team_run(w->sim->team, work_on_tiles, w);
+    mpm_team_run(w->sim->team, work_on_stretches, w);
 }
 
-// In whole blocks of particles: of one that two tiles share no lane is idle.
+// In whole blocks of particles: of one that two stretches share no lane is idle.
 static size_t chunk_begin(const struct mpm_order *order, size_t chunk) {
-    return order->tile[order->chunk[chunk]].begin / MPM_BLOCK * MPM_BLOCK;
+    return order->stretch[order->chunk[chunk]].begin / MPM_BLOCK * MPM_BLOCK;
 }
 
 // All other work goes by chunks, in the same parts. They do not take equal time, since what flows
@@ -302,38 +341,32 @@ static void work_on_chunks(void *context, int own, int there) {
             work += end - chunk_begin(order, i);
         }
     }
-    end_turn(w->sim, own, &found, work, since);
+    end_turn(w, own, &found, work, since);
 }
 
-// Work that adds to the grid, or that moves particles: with what they found, the sums in the order
-// of the chunks.
+// Work that adds to the grid, or that moves particles: then with m dx of these, in the order of the
+// chunks. What else was found stays with the threads until the step is over.
 static void for_particles(const struct mpm_sim *sim, size_t body, struct particles_work w,
-                          bool adds, struct mpm_span_result *joined) {
+                          bool adds, int *pass, double *mass_dx) {
     const struct mpm_particles *s = w.span.s = &sim->sets[body];
     w.span.grid = (struct mpm_grid *)&sim->grid;
     w.sim = sim;
     w.order = &sim->orders[body];
-    if (w.order->n_tiles == 0) {
+    if (w.order->n_stretches == 0) {
         return;
     }
+    w.body = body;
+    w.pass = (*pass)++;
     w.parts = parts_of(sim, body);
     w.n_parts = sim->team->n_there;
     if (adds) {
-        for_tiles(&w);
-    } else {
-        mpm_team_run(sim->team, work_on_chunks, &w);
+        for_stretches(&w);
+        return;
     }
-    struct mpm_span_result found = mpm_nothing_found();
-    for (int k = 0; k < w.n_parts; k++) {
-        join(&found, &sim->turns[k].found, s->dim);
-    }
-    if (found.bad != SIZE_MAX) { // what an earlier pass or body found comes first
-        found.bad = joined->bad == SIZE_MAX ? s->first_id + s->id[found.bad] : SIZE_MAX;
-    }
-    join(joined, &found, s->dim);
-    for (size_t k = 0; !adds && k < w.order->n_chunks; k++) {
+    mpm_team_run(sim->team, work_on_chunks, &w);
+    for (size_t k = 0; k < w.order->n_chunks; k++) {
         for (int d = 0; d < s->dim; d++) {
-            joined->mass_dx[d] += sim->mass_dx[k][d];
+            mass_dx[d] += sim->mass_dx[k][d];
         }
     }
 }
@@ -487,9 +520,9 @@ static void leave_stage_if_over(struct mpm_sim *sim) {
 #define MOST_DRIFT 0.999 // cells: below 1 by more than the round-off of a position in cells
 #define SORT_COST 3.0    // of a sort, in steps: 1 in cache, 3 beyond
 #define RUN_COST 1.5     // of a run, beside its particles, in particles
-#define LEAST_STEPS 120  // between two sorts for speed's sake: so they take 3 % at most
+#define LEAST_STEPS 60   // between two sorts for speed's sake: so they take 5 % at most
 
-// A sort is due when a particle may have drifted out of its tile's reach, or when runs that have
+// A sort is due when a particle may have drifted out of its stretch's reach, or when runs that have
 // been broken since the last one have cost as much as a sort does: they grow about linearly. That
 // depends on the state alone, so it comes at the same steps for any number of threads and after a
 // restart.
@@ -503,8 +536,8 @@ static bool sort_is_due(const struct mpm_sim *sim) {
 }
 
 // eqs. 7, 8, 10, and the forces of loads and rigid bodies.
-static void particles_to_grid(struct mpm_sim *sim, double dt, bool any_fbar, double *clock) {
-    struct mpm_span_result found = mpm_nothing_found();
+static void particles_to_grid(struct mpm_sim *sim, double dt, bool any_fbar, int *pass,
+                              double *clock) {
     share_out(sim);
     if (!sim->grid.sums_are_clear) {
         mpm_team_run(sim->team, clear_sums, sim);
@@ -512,10 +545,8 @@ static void particles_to_grid(struct mpm_sim *sim, double dt, bool any_fbar, dou
     sim->grid.sums_are_clear = false;
     for (size_t b = 0; b < sim->n_sets; b++) {
         const struct mpm_span span = {.dt = dt, .fbar = any_fbar && sim->sets[b].wants_fbar};
-        for_particles(sim, b, (struct particles_work){.span = span, .work = p2g}, true, &found);
+        for_particles(sim, b, (struct particles_work){.span = span, .work = p2g}, true, pass, NULL);
     }
-    sim->c.runs = found.n_runs;
-    sim->c.runs_at_sort = sim->c.steps_since_sort == 0 ? found.n_runs : sim->c.runs_at_sort;
     charge(sim, MPM_PHASE_P2G, clock);
     for (size_t k = 0; k < sim->n_loads; k++) {
         struct mpm_load *load = &sim->loads[k];
@@ -573,7 +604,8 @@ static enum mpm_status step(struct mpm_sim *sim, struct mpm_error *err) {
     const enum mpm_fbar_scheme scheme = now->fbar.scheme;
     const bool any_fbar = takes_part_in_fbar(sim);
     sim->grid.fbar_stride = mpm_fbar_scalars(scheme);
-    particles_to_grid(sim, dt, any_fbar, &clock);
+    int pass = 0;
+    particles_to_grid(sim, dt, any_fbar, &pass, &clock);
 
     // Grid, eq. 9, and boundary conditions
     struct nodes_work motion = {.sim = sim,
@@ -587,6 +619,7 @@ static enum mpm_status step(struct mpm_sim *sim, struct mpm_error *err) {
 
     // G2P, eqs. 11-17; with F-bar, eq. 19 (Algorithm 1, step 3) with it
     struct mpm_span_result found = mpm_nothing_found();
+    double mass_dx[MPM_MAX_DIM] = {0};
     for (size_t b = 0; b < sim->n_sets; b++) {
         const bool averaged = any_fbar && sim->sets[b].wants_fbar;
         const struct mpm_span span = {.dt = dt,
@@ -598,7 +631,7 @@ static enum mpm_status step(struct mpm_sim *sim, struct mpm_error *err) {
                                       .keep = now->fbar.keep};
         const struct particles_work work = {
             .span = span, .work = g2p, .clears_sums = !any_fbar && b == 0};
-        for_particles(sim, b, work, averaged, &found);
+        for_particles(sim, b, work, averaged, &pass, mass_dx);
     }
     charge(sim, MPM_PHASE_G2P, &clock);
 
@@ -610,12 +643,18 @@ static enum mpm_status step(struct mpm_sim *sim, struct mpm_error *err) {
                 const struct mpm_span span = {
                     .fbar = true, .scheme = scheme, .C = now->fbar.C, .keep = now->fbar.keep};
                 for_particles(sim, b, (struct particles_work){.span = span, .work = fbar}, false,
-                              &found);
+                              &pass, mass_dx);
             }
         }
         charge(sim, MPM_PHASE_FBAR, &clock);
     }
     sim->grid.sums_are_clear = true;
+    if (pass > 0) {
+        join_found(sim, &found);
+    }
+    memcpy(found.mass_dx, mass_dx, sizeof mass_dx);
+    sim->c.runs = found.n_runs;
+    sim->c.runs_at_sort = sim->c.steps_since_sort == 0 ? found.n_runs : sim->c.runs_at_sort;
 
     enum mpm_status status = check_result(sim, &found, time, err);
     if (!status && sim->n_rigids > 0) {
@@ -663,6 +702,10 @@ struct step_call {
 static void run_step(void *context) {
     struct step_call *call = context;
     call->status = step(call->sim, call->err);
+}
+
+void mpm_hold(struct mpm_sim *sim, void (*body)(void *context), void *context) {
+    mpm_team_hold(sim->team, body, context);
 }
 
 enum mpm_status mpm_step(struct mpm_sim *sim, struct mpm_error *err) {

@@ -27,8 +27,9 @@ static void pause_a_moment(void) {
 
 // Who goes to sleep says so and then looks at the word again; who changes the word then looks
 // whether anyone sleeps. One of them sees the other only if neither's store waits behind its look.
-// Words change at every tile and sleep is rare, so the sleeper pays for both: the kernel has every
-// running thread of the process pass a barrier (membarrier(2)). Where it cannot, each pays its own.
+// Words change at every stretch and sleep is rare, so the sleeper pays for both: the kernel has
+// every running thread of the process pass a barrier (membarrier(2)). Where it cannot, each pays
+// its own.
 static void fence_all(const struct mpm_team *team) {
     atomic_thread_fence(memory_order_seq_cst);
 #ifdef __linux__

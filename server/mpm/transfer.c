@@ -8,6 +8,7 @@
 #include <stdint.h>
 
 #include "server/mpm/basis.h"
+#include "server/mpm/fbar.h"
 #include "server/mpm/kernels.h"
 
 #define BATCH 64 // particles whose velocity gradient is kept for one call of a material's rate part
@@ -456,6 +457,7 @@ MPM_EACH_KERNEL(DEFINE)
         .p2g = p2g_##D##d_##B,                                                                     \
         .move_nodes = move_nodes_##D##d_##B,                                                       \
         .g2p = g2p_##D##d_##B,                                                                     \
+        .divide_nodes = mpm_fbar_divide,                                                           \
         .fbar = fbar_##D##d_##B,                                                                   \
         .force = force_##D##d_##B,                                                                 \
     },

@@ -53,6 +53,9 @@ struct mpm_kernels {
     // sums of the anchored scheme), with the volume of time n, to the grid, where P2G has left V:
     // eq. 19.
     void (*g2p)(const struct mpm_span *span, struct mpm_span_result *result);
+    // eq. 20, once walls have folded: F-bar's sums become averages, in the blocks with slots
+    // [begin, end); a node without volume stays out.
+    void (*divide_nodes)(const struct mpm_grid *grid, uint32_t begin, uint32_t end);
     // eqs. 20, 25: averaged ratio to the particles, deformation scaled to it; then stress and
     // position.
     void (*fbar)(const struct mpm_span *span, struct mpm_span_result *result);

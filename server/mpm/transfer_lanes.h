@@ -1,7 +1,7 @@
 // Particle-grid transfers in lanes: what server/mpm/transfer.c does, many particles at a time. A unit
 // that defines DIM includes it, and is compiled once for each instruction set, with MPM_LANES.
 //
-// A tile is worked on in batches that stay in the first-level cache, in four stages (docs/design.md
+// A stretch is worked on in batches that stay in the first-level cache, in four stages (docs/design.md
 // has the picture):
 //
 //   weights   particles in lanes: base functions of each particle along each direction, and its
@@ -31,7 +31,7 @@ extern int MPM_STAGES;
 #define STAGE(n)
 #endif
 
-#define BATCH 64                // particles
+#define BATCH MPM_BATCH
 #define MOST (BATCH + MPM_BLOCK) // of the last batch of a span, which takes what would be left over
 #define ROOM (MOST + 8)          // whole vectors, rows of cache lines
 #define PARTS (8 / MPM_LANES)    // vectors of one node's eight components
@@ -76,7 +76,7 @@ MPM_KERNEL double *at(double *field, struct extent in, int lane, int n_component
     return field + mpm_at(in.first + (size_t)lane, n_components, c);
 }
 // Where a batch ends within a vector, lanes of the same cache lines may belong to another thread's
-// tile, or to no particle: these are neither read nor written. Elsewhere vectors are moved whole:
+// stretch, or to no particle: these are neither read nor written. Elsewhere vectors are moved whole:
 // that is faster, and what a masked store has written reaches later loads only through the cache.
 MPM_KERNEL mpm_vec get(struct extent in, int lane, const double *from, double other,
                        const bool whole) {
@@ -90,8 +90,8 @@ MPM_KERNEL void put(struct extent in, int lane, double *to, mpm_vec a, const boo
         mpm_store_lanes(to, a, in.begin - lane, in.end - lane);
     }
 }
-// The same from a field of the particles, and the next batch's on the way to the cache: tiles of
-// one colour lie apart, where the processor does not look ahead.
+// The same from a field of the particles, and the next batch's on the way to the cache: stretches
+// follow each other in another order than in memory, where the processor does not look ahead.
 MPM_KERNEL void ahead(double *field, struct extent in, int lane, int n_components, int c) {
     if (MPM_LANES == 8 || lane % MPM_BLOCK == 0) { // a cache line
         __builtin_prefetch(field + mpm_at(in.next + (size_t)lane, n_components, c));
@@ -144,7 +144,7 @@ MPM_KERNEL void find_cells(struct batch *b, const struct mpm_span *span, const i
     for (int lane = 0; lane < in.end; lane += MPM_LANES) {
         mpm_vec block = mpm_splat(0), cell = mpm_splat(0);
         UNROLL for (int d = 0; d < dim; d++) {
-            // Lanes of other tiles are read, too: no pass that has them writes positions.
+            // Lanes of other stretches are read, too: no pass that has them writes positions.
             const mpm_vec x = mpm_load_aligned(at(s->x, in, lane, dim, d));
             ahead(s->x, in, lane, dim, d);
             const mpm_vec xi = (x - g->origin[d]) * g->inv_h;
@@ -564,7 +564,7 @@ MPM_KERNEL void scatter_pairs(struct batch *b, const struct mpm_grid *g, const i
 
 // ---- Update ----
 
-// What the lanes of a tile find, until it is over.
+// What the lanes of a stretch find, until it is over.
 struct found {
     mpm_vec min[MPM_MAX_DIM], max[MPM_MAX_DIM], v2_max, dx_max, mass_dx[MPM_MAX_DIM];
 };
@@ -588,7 +588,7 @@ MPM_KERNEL void found_all(const struct found *f, struct mpm_span_result *r, cons
     r->dx_max = mpm_hmax(f->dx_max);
 }
 
-// The first lane at fault is the tile's, unless there was one before.
+// The first lane at fault is the stretch's, unless there was one before.
 __attribute__((cold, noinline)) static void fault(struct mpm_span_result *r, struct extent in,
                                                   int lane, unsigned lanes, enum mpm_status status,
                                                   const double *value) {
@@ -1032,7 +1032,7 @@ MPM_KERNEL void finish_fbar(struct batch *b, const struct mpm_span *span,
     finish_of[law](b, &part, r, found);
 }
 
-// The records of what the particles give to their nodes. Lanes of other tiles are read, too: P2G
+// The records of what the particles give to their nodes. Lanes of other stretches are read, too: P2G
 // writes no particles.
 MPM_KERNEL void write_records(struct batch *b, const struct mpm_span *span, const int dim) {
     const struct mpm_particles part = *span->s, *s = &part;
@@ -1065,8 +1065,8 @@ MPM_KERNEL void write_records(struct batch *b, const struct mpm_span *span, cons
 
 // ---- The kernels ----
 
-// The batches of a tile: whole blocks of particles, of which some lanes at both ends belong to
-// other tiles.
+// The batches of a stretch: whole blocks of particles, of which some lanes at the ends of a row
+// belong to other stretches.
 #define FOR_BATCHES(b, span)                                                                       \
     for (size_t first_ = (span)->begin / MPM_BLOCK * MPM_BLOCK;                                    \
          first_ < (span)->end && batch_at((b), (span), first_);                                    \
@@ -1179,29 +1179,59 @@ MPM_KERNEL void fbar(const struct mpm_span *span, struct mpm_span_result *r, con
     found_all(&found, r, dim);
 }
 
-// eq. 9 with the components of a node in lanes.
+// eq. 9 with the components of a node in lanes: in 2D those of v^{n+1} and of its increment together.
+// Nodes without mass lie among the others where a body ends: a branch would be foretold badly there.
 MPM_KERNEL void move_nodes(const struct mpm_grid *grid, uint32_t begin, uint32_t end,
                            const struct mpm_motion *by, const int dim) {
     const size_t nodes = MPM_BLOCK_NODES(dim);
-    const mpm_four g = {by->gravity[0], by->gravity[1], by->gravity[2], 0};
+    const double *gravity = by->gravity;
+    const mpm_four g = {gravity[0], gravity[1], dim == 3 ? gravity[2] : gravity[0], gravity[1]};
+    const mpm_four has_v = {1, 1, 0, 0};
+    const struct mpm_motion copy = *by;
     for (size_t i = begin * nodes; i < end * nodes; i++) {
         const double *node = grid->node + i * MPM_NODE, m = node[0];
         double *velocity = grid->velocity + i * (size_t)MPM_VELOCITY(dim);
-        if (!(m > 0)) {
-            memset(velocity, 0, (size_t)MPM_VELOCITY(dim) * sizeof *velocity);
+        const mpm_four sums = mpm_load_four(node), force = mpm_load_four(node + MPM_NODE_FORCE);
+        const double r = m > 0 ? 1 / m : 0;
+        const mpm_four mv = dim == 2 ? __builtin_shufflevector(sums, sums, 1, 2, 1, 2)
+                                     : __builtin_shufflevector(sums, sums, 1, 2, 3, 3);
+        const mpm_four v = mv * r;
+        mpm_four f = dim == 2 ? __builtin_shufflevector(force, force, 0, 1, 0, 1) : force;
+        f += m * g;
+        for (int d = 0; copy.local != 0 && d < 4; d++) { // sign(0) = 0
+            f[d] -= v[d] != 0 ? copysign(copy.local * fabs(f[d]), v[d]) : 0;
+        }
+        f -= copy.mass * mv;
+        const mpm_four dv = copy.dt * f * r;
+        if (dim == 2) {
+            mpm_store_four(velocity, v * has_v + dv);
             continue;
         }
-        const mpm_four mv = {node[1], node[2], dim == 3 ? node[3] : 0, 0};
-        const mpm_four v = mv * (1 / m);
-        mpm_four f = mpm_load_four(node + MPM_NODE_FORCE) + m * g;
-        for (int d = 0; by->local != 0 && d < dim; d++) { // sign(0) = 0
-            f[d] -= v[d] != 0 ? copysign(by->local * fabs(f[d]), v[d]) : 0;
-        }
-        f -= by->mass * mv;
-        const mpm_four dv = by->dt * f * (1 / m), now = v + dv;
-        for (int d = 0; d < dim; d++) {
+        const mpm_four now = v + dv;
+        UNROLL for (int d = 0; d < dim; d++) {
             velocity[d] = now[d];
             velocity[dim + d] = dv[d];
+        }
+    }
+}
+
+// eq. 20's averages: four nodes at a time.
+MPM_KERNEL void divide_nodes(const struct mpm_grid *grid, uint32_t begin, uint32_t end,
+                             const int dim, const int scalars) {
+    const size_t nodes = MPM_BLOCK_NODES(dim);
+    const double *volume = grid->node + MPM_NODE_VOLUME(dim);
+    double *fbar = grid->fbar;
+    for (size_t i = begin * nodes; i < end * nodes; i += 4) {
+        const mpm_four at = {volume[i * MPM_NODE], volume[(i + 1) * MPM_NODE],
+                             volume[(i + 2) * MPM_NODE], volume[(i + 3) * MPM_NODE]};
+        const mpm_four V = mpm_positive_or_one(at);
+        double *sums = fbar + i * (size_t)scalars;
+        if (scalars == 1) {
+            mpm_store_four(sums, mpm_load_four(sums) / V);
+        } else {
+            mpm_store_four(sums, mpm_load_four(sums) / __builtin_shufflevector(V, V, 0, 0, 1, 1));
+            mpm_store_four(sums + 4,
+                           mpm_load_four(sums + 4) / __builtin_shufflevector(V, V, 2, 2, 3, 3));
         }
     }
 }
@@ -1234,9 +1264,20 @@ static void move_nodes_of(const struct mpm_grid *grid, uint32_t begin, uint32_t 
     move_nodes(grid, begin, end, motion, DIM);
 }
 
+static void divide_nodes_of(const struct mpm_grid *grid, uint32_t begin, uint32_t end) {
+    if (grid->fbar_stride == 1) {
+        divide_nodes(grid, begin, end, DIM, 1);
+    } else {
+        divide_nodes(grid, begin, end, DIM, 2);
+    }
+}
+
 #define ENTRY(B)                                                                                   \
-    [MPM_##B] = {                                                                                  \
-        .p2g = p2g_##B, .move_nodes = move_nodes_of, .g2p = g2p_##B, .fbar = fbar_##B},
+    [MPM_##B] = {.p2g = p2g_##B,                                                                   \
+                 .move_nodes = move_nodes_of,                                                      \
+                 .g2p = g2p_##B,                                                                   \
+                 .divide_nodes = divide_nodes_of,                                                  \
+                 .fbar = fbar_##B},
 #define NAME(isa, dim) NAME_OF(isa, dim)
 #if MPM_LANES == 4
 const struct mpm_kernels NAME(avx2, DIM)[MPM_N_BASES] = {BASES(ENTRY)};

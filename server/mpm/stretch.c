@@ -1,0 +1,383 @@
+// Stretches of particles, the units of the work that adds to the grid: what each has to wait for,
+// and which thread does which, when.
+#include <stdlib.h>
+#include <string.h>
+
+#include "server/mpm/basis.h"
+#include "server/mpm/order.h"
+
+#define SHORTEST (2 * MPM_BATCH) // particles
+#define LONGEST 512              // in a body of many
+#define STRETCH_WORK 12 // particles' worth of what a stretch costs besides, for sharing work out
+
+void mpm_order_free(struct mpm_order *order) {
+    free(order->tile);
+    free(order->stretch);
+    free(order->colour);
+    free(order->before_begin);
+    free(order->before);
+    free(order->work_before);
+    free(order->chunk);
+    free(order->done);
+    free(order->share);
+    free(order->flag);
+    free(order->when);
+    *order = (struct mpm_order){0};
+}
+
+// What is there is kept. False when memory is short.
+static bool resize(void *array, size_t bytes) {
+    void *moved = realloc(*(void **)array, bytes);
+    if (moved) {
+        *(void **)array = moved;
+    }
+    return moved != NULL;
+}
+
+bool mpm_order_reserve(struct mpm_order *order, size_t n) {
+    if (n > order->tile_capacity) {
+        const size_t room = n + n / 2 + 8;
+        if (!resize(&order->tile, room * sizeof *order->tile)) {
+            return false;
+        }
+        order->tile_capacity = room;
+    }
+    return true;
+}
+
+static bool reserve_stretches(struct mpm_order *order, size_t n) {
+    if (n <= order->capacity) {
+        return true;
+    }
+    const size_t room = n + n / 2 + 8;
+    if (!resize(&order->stretch, room * sizeof *order->stretch) || !resize(&order->colour, room) ||
+        !resize(&order->before_begin, (room + 1) * sizeof *order->before_begin) ||
+        !resize(&order->work_before, (room + 1) * sizeof *order->work_before) ||
+        !resize(&order->chunk, (room + 1) * sizeof *order->chunk) ||
+        !resize(&order->share, room * sizeof *order->share) ||
+        !resize(&order->flag, room * sizeof *order->flag) || !resize(&order->when, room)) {
+        return false;
+    }
+    order->capacity = room;
+    return true;
+}
+
+// ---- Finding ----
+
+// Blocks of a row follow each other along the last direction.
+static uint32_t blocks_of_row(const struct mpm_grid *grid) {
+    return (uint32_t)grid->n_blocks[grid->dim - 1];
+}
+static uint32_t row_of(const struct mpm_grid *grid, const struct mpm_stretch *stretch) {
+    return stretch->first / blocks_of_row(grid);
+}
+
+// Stencils of particles that are in blocks so far apart reach no common node: a stencil of 3 nodes,
+// from one cell before the block to one behind it, ends in the second node of the next block; one
+// of 4 would meet what comes from the block after that.
+static int apart(enum mpm_basis basis) {
+    return basis == MPM_BSPLINE3 ? 3 : 2;
+}
+
+// Whole batches from the first one that a row has particles of, so that no lane of a vector is idle
+// but at a row's ends; the last stretch of a row takes what would be left over. Rows far from each
+// other can have one colour, and so can the even stretches of a row and its odd ones.
+static bool find_stretches(struct mpm_order *order, const struct mpm_grid *grid,
+                           enum mpm_basis basis) {
+    const int along = apart(basis), dim = grid->dim;
+    const size_t n = order->n_tiles > 0 ? order->tile[order->n_tiles - 1].end : 0;
+    size_t length = n / 64 / MPM_BATCH * MPM_BATCH;
+    length = length < SHORTEST ? SHORTEST : length > LONGEST ? LONGEST : length;
+    order->n_stretches = 0;
+    order->n_colours = 2 * (dim == 2 ? along : along * along);
+    for (size_t t = 0; t < order->n_tiles;) {
+        const uint32_t row = order->tile[t].block / blocks_of_row(grid);
+        size_t end = t; // of the row's tiles
+        while (end < order->n_tiles && order->tile[end].block / blocks_of_row(grid) == row) {
+            end++;
+        }
+        int place[MPM_MAX_DIM], colour = 0;
+        mpm_grid_block_place(grid, order->tile[t].block, place);
+        for (int d = 0; d < dim - 1; d++) {
+            colour = colour * along + place[d] % along;
+        }
+        const uint32_t begin = order->tile[t].begin, past = order->tile[end - 1].end;
+        const size_t number = (past - begin) / length;
+        for (size_t k = 0; k == 0 || k < number; k++) {
+            if (!reserve_stretches(order, order->n_stretches + 1)) {
+                return false;
+            }
+            struct mpm_stretch stretch = {.begin = begin, .end = past};
+            if (k > 0) {
+                stretch.begin = order->stretch[order->n_stretches - 1].end;
+            }
+            if (k + 1 < number) {
+                stretch.end = (uint32_t)(begin / MPM_BLOCK * MPM_BLOCK + (k + 1) * length);
+            }
+            while (order->tile[t].end <= stretch.begin) {
+                t++;
+            }
+            stretch.first = order->tile[t].block;
+            while (order->tile[t].end < stretch.end) {
+                t++;
+            }
+            stretch.last = order->tile[t].block;
+            order->colour[order->n_stretches] = (uint8_t)(2 * colour + (int)(k & 1));
+            order->stretch[order->n_stretches++] = stretch;
+        }
+        t = end;
+    }
+    return true;
+}
+
+// ---- What each waits for ----
+
+static bool comes_before(const struct mpm_order *order, size_t a, size_t b) {
+    return order->colour[a] < order->colour[b] || (order->colour[a] == order->colour[b] && a < b);
+}
+
+// For all stretches, in the row at an offset, in blocks, from theirs: how many near each come
+// before it (before_begin[t + 1]), or, to `write`, which (before[before_begin[t]++]). Stretches
+// ascend by row and by block, and so do those at one offset from them.
+static void find_before(struct mpm_order *order, const struct mpm_grid *grid, const int *offset,
+                        int apart, bool write) {
+    int64_t distance = 0;
+    for (int d = 0; d < grid->dim - 1; d++) {
+        distance = distance * grid->n_blocks[d] + offset[d];
+    }
+    size_t other = 0;
+    for (size_t t = 0; t < order->n_stretches; t++) {
+        const struct mpm_stretch *own = &order->stretch[t];
+        int place[MPM_MAX_DIM];
+        bool inside = true;
+        mpm_grid_block_place(grid, own->first, place);
+        for (int d = 0; d < grid->dim - 1; d++) {
+            inside &= place[d] + offset[d] >= 0 && place[d] + offset[d] < (int)grid->n_blocks[d];
+        }
+        if (!inside) {
+            continue;
+        }
+        // Places in that row, as blocks: those of the own row's, moved.
+        const int64_t row = row_of(grid, own) + distance, width = blocks_of_row(grid);
+        const int64_t move = distance * width;
+        const int64_t from = own->first + move - (apart - 1), to = own->last + move + (apart - 1);
+        while (other < order->n_stretches && (row_of(grid, &order->stretch[other]) < row ||
+                                              (row_of(grid, &order->stretch[other]) == row &&
+                                               order->stretch[other].last < from))) {
+            other++;
+        }
+        for (size_t q = other; q < order->n_stretches && order->stretch[q].first <= to &&
+                               row_of(grid, &order->stretch[q]) == row;
+             q++) {
+            if (!comes_before(order, q, t)) {
+                continue;
+            }
+            if (write) {
+                order->before[order->before_begin[t]++] = (uint32_t)q;
+            } else {
+                order->before_begin[t + 1]++;
+            }
+        }
+    }
+}
+
+static bool find_all_before(struct mpm_order *order, const struct mpm_grid *grid,
+                            enum mpm_basis basis) {
+    const int along = apart(basis), dim = grid->dim, width = 2 * along - 1;
+    const size_t n = order->n_stretches;
+    memset(order->before_begin, 0, (n + 1) * sizeof *order->before_begin);
+    for (int write = 0; write < 2; write++) { // first their numbers, then they themselves
+        for (int k = 0; k < (dim == 2 ? width : width * width); k++) {
+            int offset[MPM_MAX_DIM];
+            for (int d = dim - 1, rest = k; d-- > 0; rest /= width) {
+                offset[d] = rest % width - (along - 1);
+            }
+            find_before(order, grid, offset, along, write);
+        }
+        if (write) { // each begin has moved on to the next one's
+            memmove(order->before_begin + 1, order->before_begin, n * sizeof *order->before_begin);
+            order->before_begin[0] = 0;
+            break;
+        }
+        for (size_t t = 0; t < n; t++) {
+            order->before_begin[t + 1] += order->before_begin[t];
+        }
+        const size_t n_before = order->before_begin[n];
+        if (n_before > order->before_capacity) {
+            if (!resize(&order->before, (n_before + n_before / 2) * sizeof *order->before)) {
+                return false;
+            }
+            order->before_capacity = n_before + n_before / 2;
+        }
+    }
+    return true;
+}
+
+bool mpm_order_stretches(struct mpm_order *order, const struct mpm_grid *grid, enum mpm_basis basis,
+                         int n_threads) {
+    order->n_chunks = 0;
+    if (!find_stretches(order, grid, basis)) {
+        return false;
+    }
+    const size_t n_flags = order->capacity + (size_t)n_threads * MPM_APART;
+    if (n_flags > order->n_flags) {
+        if (!resize(&order->done, n_flags * sizeof *order->done)) {
+            return false;
+        }
+        order->n_flags = n_flags;
+    }
+    if (order->n_stretches == 0) {
+        return true;
+    }
+    const size_t n = order->stretch[order->n_stretches - 1].end;
+    const size_t least = n / 32 < MPM_FEWEST ? MPM_FEWEST : n / 32 > MPM_MOST ? MPM_MOST : n / 32;
+    uint64_t work = 0;
+    for (size_t t = 0; t < order->n_stretches; t++) {
+        order->work_before[t] = work;
+        work += order->stretch[t].end - order->stretch[t].begin + STRETCH_WORK;
+        const size_t last = order->n_chunks > 0 ? order->chunk[order->n_chunks - 1] : 0;
+        if (order->n_chunks == 0 || order->stretch[t].begin - order->stretch[last].begin >= least) {
+            order->chunk[order->n_chunks++] = (uint32_t)t;
+        }
+    }
+    order->chunk[order->n_chunks] = (uint32_t)order->n_stretches;
+    order->work_before[order->n_stretches] = work;
+    return find_all_before(order, grid, basis);
+}
+
+// ---- Sharing out ----
+
+static uint64_t work_before_chunk(const struct mpm_order *order, size_t chunk) {
+    return order->work_before[order->chunk[chunk]];
+}
+
+size_t mpm_order_cut(const struct mpm_order *order, double share) {
+    if (order->n_stretches == 0) {
+        return 0;
+    }
+    const double wanted = share * (double)order->work_before[order->n_stretches];
+    size_t lo = 0, hi = order->n_chunks;
+    while (lo < hi) { // the first chunk with at least so much before it
+        const size_t middle = lo + (hi - lo) / 2;
+        if ((double)work_before_chunk(order, middle) < wanted) {
+            lo = middle + 1;
+        } else {
+            hi = middle;
+        }
+    }
+    const bool nearer = lo > 0 && wanted - (double)work_before_chunk(order, lo - 1) <
+                                      (double)work_before_chunk(order, lo) - wanted;
+    return nearer ? lo - 1 : lo;
+}
+
+// When a part comes to a stretch: first those that other parts wait for, last those that wait for
+// other parts, each with what has to come before or after it.
+enum when { BETWEEN, FIRST, LAST, PLACED };
+
+// Marks what t waits for FIRST if it is, or t LAST if what it waits for is.
+static void spread(struct mpm_order *order, size_t t, size_t begin, size_t end, bool first) {
+    for (uint32_t b = order->before_begin[t]; b < order->before_begin[t + 1]; b++) {
+        const uint32_t q = order->before[b];
+        if (first && order->when[t] == FIRST && q >= begin && q < end) {
+            order->when[q] = FIRST;
+        } else if (!first && order->when[q] == LAST && order->when[t] != FIRST) {
+            order->when[t] = LAST;
+        }
+    }
+}
+
+static void find_first_and_last(struct mpm_order *order, const uint32_t *parts, int n) {
+    memset(order->when, BETWEEN, order->n_stretches);
+    for (int k = 0; k < n; k++) {
+        const size_t begin = order->chunk[parts[k]], end = order->chunk[parts[k + 1]];
+        for (size_t t = begin; t < end; t++) {
+            for (uint32_t b = order->before_begin[t]; b < order->before_begin[t + 1]; b++) {
+                const uint32_t q = order->before[b];
+                if (q < begin || q >= end) {
+                    order->when[q] = FIRST;
+                    order->when[t] = order->when[t] == FIRST ? FIRST : LAST;
+                }
+            }
+        }
+    }
+    for (int k = 0; k < n; k++) {
+        const size_t begin = order->chunk[parts[k]], end = order->chunk[parts[k + 1]];
+        for (int colour = order->n_colours; colour-- > 0;) { // from what comes last
+            for (size_t t = end; t-- > begin;) {
+                if (order->colour[t] == colour) {
+                    spread(order, t, begin, end, true);
+                }
+            }
+        }
+        for (int colour = 0; colour < order->n_colours; colour++) {
+            for (size_t t = begin; t < end; t++) {
+                if (order->colour[t] == colour) {
+                    spread(order, t, begin, end, false);
+                }
+            }
+        }
+    }
+}
+
+// The stretches of a part that are done at a time, by colour; shared out from `at` on. Returns
+// where they end.
+static size_t share_by_colour(struct mpm_order *order, size_t begin, size_t end, enum when when,
+                              size_t at) {
+    for (int colour = 0; colour < order->n_colours; colour++) {
+        for (size_t t = begin; t < end; t++) {
+            if (order->colour[t] == colour && order->when[t] == when) {
+                order->share[at++] = (uint32_t)t;
+            }
+        }
+    }
+    return at;
+}
+
+// What a stretch waits for that is not yet placed, or itself.
+static uint32_t first_of(const struct mpm_order *order, uint32_t t) {
+    for (uint32_t b = order->before_begin[t]; b < order->before_begin[t + 1]; b++) {
+        if (order->when[order->before[b]] == BETWEEN) {
+            return order->before[b];
+        }
+    }
+    return t;
+}
+
+// A stretch, after those that it waits for and these after theirs. Those on the way to the one that
+// comes first are kept at the other end of what is not yet shared out.
+static size_t share_in_place(struct mpm_order *order, uint32_t t, size_t at, size_t end) {
+    size_t top = end;
+    order->share[--top] = t;
+    while (top < end) {
+        const uint32_t now = order->share[top], next = first_of(order, now);
+        if (next != now) {
+            order->share[--top] = next;
+        } else {
+            order->when[now] = PLACED;
+            top++;
+            order->share[at++] = now;
+        }
+    }
+    return at;
+}
+
+void mpm_order_share(struct mpm_order *order, const uint32_t *parts, int n) {
+    if (order->n_stretches == 0) {
+        return;
+    }
+    find_first_and_last(order, parts, n);
+    for (int k = 0; k < n; k++) {
+        const size_t begin = order->chunk[parts[k]], end = order->chunk[parts[k + 1]];
+        size_t at = share_by_colour(order, begin, end, FIRST, begin);
+        for (size_t t = begin; t < end; t++) {
+            if (order->when[t] == BETWEEN) {
+                at = share_in_place(order, (uint32_t)t, at, end);
+            }
+        }
+        share_by_colour(order, begin, end, LAST, at);
+        for (size_t i = begin; i < end; i++) {
+            order->flag[order->share[i]] = (uint32_t)(i + (size_t)k * MPM_APART);
+            atomic_init(&order->done[i + (size_t)k * MPM_APART], order->pass);
+        }
+    }
+}

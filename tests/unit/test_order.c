@@ -1,0 +1,165 @@
+// Stretches of random bodies: whole, in one order that any number of threads can keep, and apart.
+#include <setjmp.h>
+#include <stdarg.h>
+#include <stddef.h>
+#include <stdint.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include <cmocka.h>
+
+#include "server/mpm/order.h"
+
+static uint32_t state_of_random;
+static uint32_t random_below(uint32_t n) {
+    state_of_random = state_of_random * 1664525u + 1013904223u;
+    return (uint32_t)(((uint64_t)state_of_random * n) >> 32);
+}
+
+// Blocks in use at random, from nearly none to nearly all, each with up to `most` particles.
+static size_t make_tiles(struct mpm_order *order, const struct mpm_grid *grid, uint32_t per_cent,
+                         uint32_t most) {
+    const uint32_t n_blocks = (uint32_t)(grid->n_blocks[0] * grid->n_blocks[1] * grid->n_blocks[2]);
+    uint32_t at = 0;
+    order->n_tiles = 0;
+    for (uint32_t block = 0; block < n_blocks; block++) {
+        if (random_below(100) < per_cent) {
+            assert_true(mpm_order_reserve(order, order->n_tiles + 1));
+            const uint32_t end = at + 1 + random_below(most);
+            order->tile[order->n_tiles++] =
+                (struct mpm_tile){.begin = at, .end = end, .block = block};
+            at = end;
+        }
+    }
+    return at;
+}
+
+static bool reach_common_nodes(const struct mpm_grid *grid, const struct mpm_stretch *a,
+                               const struct mpm_stretch *b, int apart) {
+    int of_a[2][MPM_MAX_DIM], of_b[2][MPM_MAX_DIM];
+    mpm_grid_block_place(grid, a->first, of_a[0]);
+    mpm_grid_block_place(grid, a->last, of_a[1]);
+    mpm_grid_block_place(grid, b->first, of_b[0]);
+    mpm_grid_block_place(grid, b->last, of_b[1]);
+    for (int d = 0; d < grid->dim; d++) {
+        if (of_a[0][d] - of_b[1][d] >= apart || of_b[0][d] - of_a[1][d] >= apart) {
+            return false;
+        }
+    }
+    return true;
+}
+
+static bool is_listed(const struct mpm_order *order, size_t t, size_t other) {
+    for (uint32_t b = order->before_begin[t]; b < order->before_begin[t + 1]; b++) {
+        if (order->before[b] == other) {
+            return true;
+        }
+    }
+    return false;
+}
+
+static void check_stretches(const struct mpm_order *order, const struct mpm_grid *grid, size_t n,
+                            int apart) {
+    const int last = grid->dim - 1;
+    size_t at = 0, tile = 0;
+    for (size_t t = 0; t < order->n_stretches; t++) {
+        const struct mpm_stretch *s = &order->stretch[t];
+        assert_int_equal(s->begin, at);
+        assert_true(s->end > s->begin);
+        while (order->tile[tile].end <= s->begin) {
+            tile++;
+        }
+        assert_int_equal(s->first, order->tile[tile].block);
+        while (order->tile[tile].end < s->end) {
+            tile++;
+        }
+        assert_int_equal(s->last, order->tile[tile].block);
+        assert_int_equal(s->first / (uint32_t)grid->n_blocks[last],
+                         s->last / (uint32_t)grid->n_blocks[last]);
+        at = s->end;
+        for (size_t other = 0; other < order->n_stretches; other++) {
+            const bool meet =
+                t != other && reach_common_nodes(grid, s, &order->stretch[other], apart);
+            const int listed = is_listed(order, t, other) + is_listed(order, other, t);
+            if (listed != meet) {
+                fail_msg("%zu and %zu: %d times listed", t, other, listed);
+            }
+        }
+    }
+    assert_int_equal(at, n);
+}
+
+// Threads that each go through their part, whoever is next at random: all come to an end, and
+// nobody passes one that it waits for.
+static void check_shares(struct mpm_order *order, int n_parts) {
+    uint32_t parts[9], next[8];
+    bool *done = calloc(order->n_stretches + 1, sizeof *done);
+    for (int k = 0; k <= n_parts; k++) {
+        parts[k] = k == n_parts ? (uint32_t)order->n_chunks
+                                : (uint32_t)mpm_order_cut(order, (double)k / n_parts);
+    }
+    mpm_order_share(order, parts, n_parts);
+    for (int k = 0; k < n_parts; k++) {
+        next[k] = order->chunk[parts[k]];
+        for (uint32_t i = order->chunk[parts[k]]; i < order->chunk[parts[k + 1]]; i++) {
+            assert_in_range(order->share[i], order->chunk[parts[k]],
+                            order->chunk[parts[k + 1]] - 1);
+        }
+    }
+    size_t left = order->n_stretches;
+    for (size_t idle = 0; left > 0; idle++) {
+        assert_true(idle < 1000); // nobody could go on
+        const int k = (int)random_below((uint32_t)n_parts);
+        if (next[k] == order->chunk[parts[k + 1]]) {
+            continue;
+        }
+        const uint32_t t = order->share[next[k]];
+        bool ready = true;
+        for (uint32_t b = order->before_begin[t]; b < order->before_begin[t + 1]; b++) {
+            ready &= done[order->before[b]];
+        }
+        if (ready) {
+            assert_false(done[t]);
+            done[t] = true;
+            next[k]++;
+            left--;
+            idle = 0;
+        }
+    }
+    free(done);
+}
+
+static void test_order_stretches_of_random_bodies(void **state) {
+    (void)state;
+    static const enum mpm_basis bases[] = {MPM_LINEAR, MPM_BSPLINE2, MPM_BSPLINE3};
+    for (uint32_t k = 0; k < 400; k++) {
+        struct mpm_order order = {0};
+        state_of_random = k;
+        const int dim = 2 + (int)(k & 1);
+        const uint32_t most = dim == 2 ? 24 : 8;
+        struct mpm_grid grid = {.dim = dim, .n_blocks = {1, 1, 1}};
+        for (int d = 0; d < dim; d++) {
+            grid.n_blocks[d] = 1 + (int)random_below(most);
+        }
+        static const uint32_t particles[] = {4, 64, 700};
+        const enum mpm_basis basis = bases[random_below(3)];
+        // The same order again and again, as a simulation does.
+        for (int again = 0; again < 2; again++) {
+            const size_t n =
+                make_tiles(&order, &grid, 1 + random_below(100), particles[random_below(3)]);
+            assert_true(mpm_order_stretches(&order, &grid, basis, 8));
+            check_stretches(&order, &grid, n, basis == MPM_BSPLINE3 ? 3 : 2);
+            for (int n_parts = 1; n > 0 && n_parts <= 8; n_parts++) {
+                check_shares(&order, n_parts);
+            }
+        }
+        mpm_order_free(&order);
+    }
+}
+
+int main(void) {
+    const struct CMUnitTest tests[] = {
+        cmocka_unit_test(test_order_stretches_of_random_bodies),
+    };
+    return cmocka_run_group_tests(tests, NULL, NULL);
+}
