@@ -84,7 +84,7 @@ $(call levels,$(LANES_SRC)): ALL_CFLAGS += $(LANES_FLAGS)
 
 .PHONY: studies all programs deps deps-page deps-long deps-report libmpm demo report report-page report-docs check check-all check-layers check-unit \
 	check-physics check-api check-page \
-	check-cli check-loss check-hard check-asan check-clang check-fuzz check-tsan check-tsan-solver unit-programs check-long bench bench-docs bench-solver bench-peer \
+	check-cli check-loss check-hard check-shaken check-asan check-clang check-fuzz check-tsan check-tsan-solver unit-programs check-long bench bench-docs bench-solver bench-peer \
 	bench-recording bench-page bench-status bench-threads bench-tutorial fuzz install uninstall format clean help
 .DELETE_ON_ERROR:
 .SECONDARY:
@@ -269,6 +269,13 @@ $(B)/tests/failing.so: tests/loss/failing.c
 check-loss: all $(B)/tests/failing.so ## kills, failing disks, recorders that stall: nothing is lost
 	$(Q)FBARD=$(CURDIR)/$(B)/fbard FBAR=$(CURDIR)/$(B)/fbar FAILING=$(CURDIR)/$(B)/tests/failing.so $(PYTEST) -s tests/loss
 
+# What a busy machine does to them, and more of it: none may fail, nor take anything for granted that is only likely.
+SHAKEN = FBARD_LONG= FBARD=$(CURDIR)/$(B)/fbard FBAR=$(CURDIR)/$(B)/fbar FAILING=$(CURDIR)/$(B)/tests/failing.so PAGE_MODULES=$(CURDIR)/build/page tests/shake.py
+check-shaken: all $(B)/tests/failing.so $(PAGE_MODULES)/.installed ## the tests while their processes are frozen and their threads starved (tests/shake.py)
+	$(Q)set -e; for way in freeze starve; do echo "== $$way"; \
+	  $(SHAKEN) $$way $(PYTEST) tests/api; $(SHAKEN) $$way $(PYTEST) -n 2 --dist loadfile tests/cli; $(SHAKEN) $$way $(PYTEST) tests/loss; \
+	  $(SHAKEN) $$way node --test tests/page/page.test.mjs; done
+
 # The same tests under AddressSanitizer and UBSan. `make check` leaves out what takes long there: the programs that
 # step many variants through the same code, and the API but for requests that are wrong and the model; `make check-long` has it all.
 ASAN_SLOW = $(if $(FBARD_LONG),,contact state boundary fbar)
@@ -319,7 +326,7 @@ check-clang: ## warnings and unit tests with clang 14
 	  build/clang/fbard build/clang/fbar check-unit
 
 check-long: deps-long deps-page ## the longer verification: minutes to hours
-	@FBARD_LONG=1 $(MAKE) --no-print-directory check-all check-clang check-tsan check-tsan-solver
+	@FBARD_LONG=1 $(MAKE) --no-print-directory check-all check-clang check-tsan check-tsan-solver check-shaken
 
 bench: bench-solver bench-recording bench-status bench-threads ## speed: the kernels, what recording costs, how fast the daemon answers, when threads pay
 

@@ -138,7 +138,9 @@ def test_stopped_recorder_holds_the_run_until_it_goes_on(place):
     for d in (wide, daemon):
         d.create(POOL, id="run", start=False)
     whole = wide.record("run", "a.h5")
-    recorder, other = daemon.record("run", "a.h5"), daemon.record("run", "b.h5")
+    # It is stopped here, and by nobody else (shake.py).
+    recorder = daemon.record("run", "a.h5", environment={"SHAKE": "no"})
+    other = daemon.record("run", "b.h5")
     until(lambda: len(daemon.run("run")["recorders"]) == 2 and len(wide.run("run")["recorders"]) == 1)
     recorder.send_signal(signal.SIGSTOP)
     for d in (wide, daemon):
