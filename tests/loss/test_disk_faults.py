@@ -291,7 +291,11 @@ def test_power_syncs_each_frame_before_it_is_published(place):
     assert counts["power"] >= counts["process"] + frames + events, counts
     daemon, outcomes = place("fails"), []
     daemon.data.mkdir()
-    for n in range(12, counts["power"], 1 if STRIDE == 1 else 3):  # from 12 on: the daemon has started
+    # From 12 on: the daemon has started. Every third, and which are fdatasyncs is a matter of the threads' order: those
+    # between as well where there were too few.
+    for n in sorted(range(12, counts["power"]), key=lambda n: n if STRIDE == 1 else n % 3):
+        if STRIDE > 1 and n < 15 and outcomes.count("failed") >= 5:
+            break
         shutil.rmtree(daemon.data)
         daemon.data.mkdir()
         daemon.environment = failing(daemon.data, n)
