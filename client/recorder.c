@@ -185,12 +185,13 @@ static void show(struct recorder *r) {
 // patience is over.
 static enum recorder_outcome wait_for_daemon(struct recorder *r) {
     const double deadline = recorder_now() + r->options->patience_s;
-    const int interrupts = interrupt_count();
+    if (interrupt_count() > r->interrupts) // in the middle of what broke off
+        return RECORDER_GOOD;
     terminal_note("the daemon at %s is away (%s); waiting up to %.0f s", r->client->url, r->why,
                   r->options->patience_s);
     while (recorder_now() < deadline) {
         usleep(200000);
-        if (interrupt_count() > interrupts)
+        if (interrupt_count() > r->interrupts)
             return RECORDER_GOOD;
         if (recorder_connect(r) == RECORDER_GOOD) {
             terminal_note("the daemon is back");
@@ -266,11 +267,10 @@ static enum recorder_outcome turn(struct recorder *r) {
 // Until every frame is in the log: RECORDER_OVER; RECORDER_AWAY, RECORDER_LOST or RECORDER_DISK
 // otherwise. RECORDER_GOOD: interrupted before.
 static enum recorder_outcome follow(struct recorder *r) {
-    int interrupts_seen = 0;
     double deadline = INFINITY;
     for (;;) {
-        if (interrupt_count() > interrupts_seen) {
-            interrupts_seen = interrupt_count();
+        if (interrupt_count() > r->interrupts) {
+            r->interrupts = interrupt_count();
             const enum recorder_outcome outcome = pass_on_interrupt(r, &deadline);
             if (outcome != RECORDER_GOOD)
                 return outcome == RECORDER_OVER && !r->ended ? RECORDER_GOOD : outcome;

@@ -25,6 +25,7 @@ struct recorder {
     size_t capacity;
     uint64_t synced_frames, synced_bytes;
     double synced_at, heard_at, shown_at, indexed_at, polled_step;
+    int interrupts; // that were heeded; one more ends what waits
     bool has_scene, complete, ended, registered, no_recorders;
     char why[512];
 };

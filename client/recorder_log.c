@@ -209,7 +209,6 @@ static enum recorder_outcome append_changes(struct recorder *r) {
 }
 
 enum recorder_outcome recorder_complete_log(struct recorder *r) {
-    const int interrupts = interrupt_count();
     const double begun = recorder_now();
     bool told = false;
     for (;;) {
@@ -230,7 +229,7 @@ enum recorder_outcome recorder_complete_log(struct recorder *r) {
             return answer;
         if (over)
             break;
-        if (interrupt_count() > interrupts)
+        if (interrupt_count() > r->interrupts)
             return RECORDER_GOOD;
         usleep(waited < 1 ? 20000 : 200000);
     }

@@ -321,6 +321,31 @@ def test_record_interrupted_closes_the_file_and_resumes(fbar, fake, start_fbar, 
     check_frames(tmp_path / "a.h5", daemon.frames)
 
 
+def test_record_interrupted_while_the_daemon_goes_away_does_not_wait_for_it(fake, start_fbar, tmp_path):
+    """The signal comes while an answer is waited for, and instead of the answer the end of the connection."""
+    daemon, asked, held = fake(), threading.Event(), threading.Event()
+    recorder = start_fbar("record", "r1", "-o", "a.h5", "--wait", 5, url=daemon.url)
+    joined(daemon)
+    daemon.advance(3)
+    wait_until(lambda: 2 in daemon.acks)
+    route = daemon.route
+
+    def hold(method, path, body, headers):
+        if path == "/v1/runs/r1":
+            asked.set()
+            held.wait()
+        return route(method, path, body, headers)
+    daemon.route = hold
+    assert asked.wait(PATIENCE)
+    recorder.send_signal(signal.SIGINT)
+    daemon.down()
+    held.set()
+    _, err = recorder.communicate(timeout=PATIENCE)
+    assert recorder.returncode == 130 and "waiting up to" not in err, err
+    check_frames(tmp_path / "a.h5", daemon.frames[:3], complete=False)
+    daemon.up()
+
+
 def test_record_leaves_a_finished_recording_alone(fbar, fake, tmp_path):
     daemon = fake()
     daemon.advance(20, live=False)
