@@ -6,6 +6,7 @@ its checkpoint, and its recording by `fbar record`; both are made for that (prot
 """
 import concurrent.futures
 import ctypes
+import fcntl
 import http.client
 import json
 import math
@@ -26,7 +27,7 @@ ROOT = pathlib.Path(__file__).resolve().parents[2]
 FBARD = os.environ.get("FBARD") or str(ROOT / "build" / "fbard")
 FBAR = os.environ.get("FBAR") or str(ROOT / "build" / "fbar")
 FINAL = ("completed", "failed", "cancelled")
-PATIENCE = 600  # s for a request, and for the daemon of an earlier call to end; the machine may be busy
+PATIENCE = 600  # s for a request, and for the daemon and recorders of an earlier call to end; the machine may be busy
 
 
 class Trouble(Exception):
@@ -168,6 +169,22 @@ class Runner:
         with self.lock:
             print(text, flush=True)
 
+    def alone(self):
+        """A file whose lock every fbar of ours holds as well. The ones of a report that was killed a moment ago end soon
+        after it; until then they are at their recordings, which must not be touched."""
+        held, until, told = open(self.folder / "lock", "w"), time.monotonic() + PATIENCE, False
+        while True:
+            try:
+                fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                return held
+            except BlockingIOError:
+                if not told:
+                    self.say(f"an earlier report's recorders are still at work in {self.folder}: waiting for them")
+                told = True
+            if time.monotonic() > until:
+                raise Trouble(f"another report works in {self.folder}")
+            time.sleep(0.2)
+
     def client(self, name, *words):
         """Runs fbar, its output into NAME.log; gives its exit status."""
         with open(self.folder / f"{name}.log", "ab") as log:
@@ -176,7 +193,7 @@ class Runner:
                     raise Trouble("stopped")
                 process = subprocess.Popen([FBAR, "--url", self.daemon.url, *map(str, words)],
                                            stdin=subprocess.DEVNULL, stdout=log, stderr=log,
-                                           preexec_fn=dies_with_parent)  # fmt: skip
+                                           pass_fds=[self.held.fileno()], preexec_fn=dies_with_parent)  # fmt: skip
                 self.clients.add(process)
             status = process.wait()
             with self.lock:
@@ -229,7 +246,7 @@ class Runner:
         if twice:
             raise Trouble(f"two cases of the same name: {', '.join(sorted(twice))}")
         self.folder.mkdir(parents=True, exist_ok=True)
-        with Daemon(self.base, self.jobs, self.threads) as self.daemon:
+        with self.alone() as self.held, Daemon(self.base, self.jobs, self.threads) as self.daemon:
             wanted = set(names)
             for run in self.daemon.ask("GET", "/v1/runs")["runs"]:
                 if run["id"] not in wanted:  # of another list of cases, or left by full()

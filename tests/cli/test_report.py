@@ -1,10 +1,13 @@
 """The report (bench/report) in its size `tiny`: seconds of runs and no physics, but every section, killed on the way."""
 import base64
+import contextlib
 import io
 import os
+import pathlib
 import re
 import signal
 import subprocess
+import time
 
 import h5py
 import numpy as np
@@ -31,14 +34,57 @@ def finished(process):
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
-    """(folder, what the report printed): it was killed with kill -9 in mid-run, and called again."""
+    """(folder, what the report printed): it was killed with kill -9 in mid-run, and called again while a recorder of the
+    first call was still there."""
     folder = tmp_path_factory.mktemp("report")
     first = report(folder)
-    wait_until(lambda: first.poll() is not None or list((folder / "runs").glob("*.h5.log")))
+    stopped = []
+
+    def stop_a_recorder():
+        for pid in recorders_of(first.pid):
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGSTOP)
+                file = words_of(f"/proc/{pid}/cmdline", "\0")[-2]
+                if state_of(pid) == "T" and pathlib.Path(file + ".log").exists():
+                    stopped.append(pid)
+                    return True
+                os.kill(pid, signal.SIGCONT)
+        return first.poll() is not None
+
+    wait_until(stop_a_recorder)
     assert first.poll() is None
     first.send_signal(signal.SIGKILL)
     first.communicate()
-    return folder, finished(report(folder))
+    second, said = report(folder), []
+    try:
+        for line in second.stdout:
+            said.append(line)
+            if "waiting for them" in line:
+                break
+        assert "waiting for them" in said[-1], said
+    finally:
+        os.kill(stopped[0], signal.SIGCONT)
+    return folder, "".join(said) + finished(second)
+
+
+def recorders_of(pid):
+    """The fbar among the children of a report."""
+    children = [p for task in pathlib.Path(f"/proc/{pid}/task").glob("*/children") for p in words_of(task)]
+    return [int(p) for p in children if "fbar" in words_of(f"/proc/{p}/comm")]
+
+
+def words_of(path, between=None):
+    try:
+        return pathlib.Path(path).read_text().split(between)
+    except OSError:  # gone
+        return ["", ""]
+
+
+def state_of(pid):
+    """Of a process that was told to stop: "T" once it has, another letter if it ends."""
+    while (state := (words_of(f"/proc/{pid}/stat", ")")[-1].split() or ["X"])[0]) in ("R", "S", "D"):
+        time.sleep(0.001)
+    return state
 
 
 def test_report_goes_on_after_a_kill(made):
