@@ -140,21 +140,26 @@ def test_slowhttptest_leaves_the_api_answering(daemon, how):
         pytest.skip("no slowhttptest")
     if is_sanitized():
         pytest.skip("a matter of time, not of memory; the idle connections above are for that")
-    attack = subprocess.Popen(
-        ["slowhttptest", *how, "-c", "600", "-r", "200", "-i", "1", "-l", "3", "-x", "24", "-p", "1",
-         "-u", daemon.http + ("/openapi.json" if how == ["-X"] else "/v1/runs")],
-        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)  # fmt: skip
-    took = []
-    try:
-        while attack.poll() is None:
-            took.append(seconds(lambda: daemon.get("/v1/runs")))
-            time.sleep(0.05)
-    finally:
-        attack.kill()
-        attack.wait()
-    # Kept out, it would be answered once or twice, when the attack is over.
-    took.sort()
-    assert len(took) > 5 and took[len(took) // 2] < SOON, took
+    def answers():
+        """s that each took while the attack went on."""
+        attack = subprocess.Popen(
+            ["slowhttptest", *how, "-c", "600", "-r", "200", "-i", "1", "-l", "3", "-x", "24", "-p", "1",
+             "-u", daemon.http + ("/openapi.json" if how == ["-X"] else "/v1/runs")],
+            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)  # fmt: skip
+        took = []
+        try:
+            while attack.poll() is None:
+                took.append(seconds(lambda: daemon.get("/v1/runs")))
+                time.sleep(0.05)
+        finally:
+            attack.kill()
+            attack.wait()
+        return sorted(took)
+
+    # Kept out, it would be answered once or twice, when the attack is over; so it would be, too, where all stood still
+    # for as long, but hardly three times.
+    took = next((t for t in (answers() for _ in range(3)) if len(t) > 5), [])
+    assert took and took[len(took) // 2] < SOON, took
 
 
 @pytest.mark.long
