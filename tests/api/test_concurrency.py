@@ -4,6 +4,7 @@ import concurrent.futures
 import contextlib
 import pathlib
 import random
+import re
 import time
 
 import pytest
@@ -180,15 +181,16 @@ def test_thousand_runs_come_and_go(daemon):
         assert daemon.memory() < memory + 20e6
 
 
-def ready_seconds(d):
-    """{run: how long its thread has had a core or waited for one}, by the kernel (its sched-stats.txt: schedstat)."""
-    ready = {}
+def waits(d):
+    """{run: how often its thread has gone to wait for something}, by the kernel's account (proc(5): voluntary_ctxt_switches);
+    not how often another thread was given its core."""
+    found = {}
     for task in pathlib.Path(f"/proc/{d.process.pid}/task").iterdir():
         with contextlib.suppress(OSError):  # those of connections come and go
             name = (task / "comm").read_text().strip()
-            on_core, in_line, _ = map(int, (task / "schedstat").read_text().split())
-            ready[name.removeprefix("run ")] = 1e-9 * (on_core + in_line)
-    return ready
+            count = re.search(r"\nvoluntary_ctxt_switches:\s*(\d+)", (task / "status").read_text())[1]
+            found[name.removeprefix("run ")] = int(count)
+    return found
 
 
 def test_runs_side_by_side_do_not_wait_for_each_other_and_keep_their_bits(fresh):
@@ -200,13 +202,13 @@ def test_runs_side_by_side_do_not_wait_for_each_other_and_keep_their_bits(fresh)
     # These go on, so that none is over while it is looked at.
     runs = [d.create(merged(scene, {"time": {"end": 1e3}}), id=f"r{k}")["id"] for k in range(4)]
     begun = max(d.wait_step(run, 1)["step"] for run in runs)
-    before = ready_seconds(d)
+    before = waits(d)
     until(lambda: max(d.run(run)["step"] for run in runs) >= begun + 10000)
     # What each gets of the cores is the kernel's, and on a machine that is not ours alone it is anything. Ours is that
-    # none waits for another: each was ready as long as the others, on a core or in the line for one.
-    after = ready_seconds(d)
-    ready = [after[run] - before[run] for run in runs]
-    assert min(ready) > max(ready) / 2, ready
+    # none waits for another: 0 to 4 times here for whatever it is, 33 to 350 times where a lock of all is held in a step.
+    after = waits(d)
+    often = {run: after[run] - before[run] for run in runs}
+    assert all(count < 25 for count in often.values()), often
     rows = d.csv("alone").splitlines()
     for run in runs:
         until(lambda run=run: any(f["step"] > steps for f in d.frames(run)))
