@@ -30,6 +30,12 @@ def index(daemon, run="run"):
     return daemon.get(f"/v1/runs/{run}/frames")
 
 
+def held(daemon):
+    """The run, once it waits for a recorder: it may have waited for the disk before."""
+    return until(lambda: (now := daemon.run("run"))["state"] == "waiting" and any("recorder" in w for w in now["warnings"])
+                 and now)  # fmt: skip
+
+
 def bytes_kept(daemon, run="run"):
     return sum(f["bytes"] for f in index(daemon, run)["frames"])
 
@@ -38,16 +44,16 @@ def test_run_waits_for_a_recorder_and_goes_on_when_it_acknowledges(daemon):
     calm = merged(POOL, {"output": {"journal_bytes": 10**9}})
     daemon.create(calm, id="calm")
     daemon.create(POOL, id="run", recorders=["slow"])
-    run = daemon.wait("run", "waiting")
+    run = held(daemon)
     assert any("recorder slow" in w for w in run["warnings"]), run["warnings"]
     assert [(r["name"], r["acked"]) for r in run["recorders"]] == [("slow", -1)]
-    held = index(daemon)
-    assert held["gone"] == [] and held["first"] == 0
-    n = len(held["frames"])
-    # A checkpoint takes the frames on their way, four at most, over the budget.
-    assert 0.8 * BUDGET < bytes_kept(daemon) <= BUDGET + 5 * held["frames"][0]["bytes"]
+    there = index(daemon)
+    assert there["gone"] == [] and there["first"] == 0
+    # A checkpoint takes the frames on their way, four at most, over the budget; one may be on its way to a slow disk.
+    until(lambda: 0.8 * BUDGET < bytes_kept(daemon))
     time.sleep(0.3)
-    assert len(index(daemon)["frames"]) == n and daemon.run("run")["state"] == "waiting"
+    n = len(index(daemon)["frames"])
+    assert bytes_kept(daemon) <= BUDGET + 5 * there["frames"][0]["bytes"] and daemon.run("run")["state"] == "waiting"
     # A second recorder that is ahead changes nothing; what both have may go.
     put(daemon, "quick", n - 1)
     time.sleep(0.2)
@@ -95,7 +101,7 @@ def test_run_fails_with_its_frames_kept_where_full_means_fail(daemon):
 
 def test_removing_the_recorder_lets_the_run_go_on(daemon):
     daemon.create(POOL, id="run", recorders=["gone", "other"])
-    daemon.wait("run", "waiting")
+    held(daemon)
     daemon.ask("DELETE", "/v1/runs/run/recorders/gone")
     time.sleep(0.2)
     assert daemon.run("run")["state"] == "waiting", "there is another one"
@@ -107,11 +113,11 @@ def test_removing_the_recorder_lets_the_run_go_on(daemon):
 
 def test_waiting_survives_a_kill_and_can_be_paused_and_cancelled(daemon):
     daemon.create(POOL, id="run", recorders=["slow"])
-    daemon.wait("run", "waiting")
+    held(daemon)
     before = index(daemon)["frames"]
     daemon.kill()
     daemon.start()
-    daemon.wait("run", "waiting")
+    held(daemon)
     again = index(daemon)["frames"]
     assert again[:len(before)] == before and bytes_kept(daemon) <= BUDGET + 6 * before[0]["bytes"]
     began = time.monotonic()
@@ -120,7 +126,7 @@ def test_waiting_survives_a_kill_and_can_be_paused_and_cancelled(daemon):
         assert daemon.run("run")["state"] == "paused"
         assert not any("checkpoint" in w for w in daemon.run("run")["warnings"])
         daemon.act("run", "resume")
-        daemon.wait("run", "waiting")
+        held(daemon)
     assert bytes_kept(daemon) <= BUDGET + 8 * before[0]["bytes"]
     assert time.monotonic() - began < 30
     daemon.ask("POST", "/v1/runs/run:snapshot", status=503)
@@ -145,7 +151,7 @@ def test_stopped_recorder_holds_the_run_until_it_goes_on(place):
     recorder.send_signal(signal.SIGSTOP)
     for d in (wide, daemon):
         d.act("run", "resume")
-    run = daemon.wait("run", "waiting")
+    run = held(daemon)
     assert min(r["acked"] for r in run["recorders"]) < 5
     time.sleep(0.5)
     assert daemon.run("run")["state"] == "waiting" and daemon.run("run")["step"] < 600
@@ -165,7 +171,7 @@ def test_durability_and_budget_change_while_it_runs(daemon):
         daemon.patch("run", {"output": {"durability": ("power", "process")[k % 2]}})
         daemon.wait_step("run", step + 20)
     daemon.patch("run", {"output": {"journal_bytes": BUDGET}})  # what is there already stays
-    run = daemon.wait("run", "waiting")
+    run = held(daemon)
     frames = index(daemon)
     assert frames["first"] == 0 and run["warnings"] and run["epoch"] == 0
     daemon.patch("run", {"output": {"journal_bytes": 10**8}, "time": {"end": run["time"] + 0.2}})
