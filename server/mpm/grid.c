@@ -142,7 +142,6 @@ void mpm_grid_deactivate(struct mpm_grid *grid) {
         grid->slot[grid->block[s]] = 0;
     }
     grid->n_slots = 1;
-    grid->sums_are_clear = false;
 }
 
 static uint32_t block_at(const struct mpm_grid *g, const int *place) {

@@ -43,7 +43,6 @@ struct mpm_grid {
     // it. Rows of MPM_MAX_STENCIL.
     uint8_t *which, *place;
     double *node;        // (nodes, MPM_NODE)
-    bool sums_are_clear; // node: of all slots
     double *velocity;    // (nodes, MPM_VELOCITY)
     double *fbar;        // (nodes, scalars) sums that F-bar averages; NULL while F-bar is off
     int fbar_stride, fbar_capacity; // scalars of the scheme in force, and of the widest so far

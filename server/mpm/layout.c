@@ -9,6 +9,7 @@ static bool lay_out(struct mpm_sim *sim) {
     const enum mpm_basis basis = sim->def->basis;
     mpm_grid_deactivate(&sim->grid);
     sim->n_shared = 0;
+    sim->sums_are_clear = false;
     for (size_t b = 0; b < sim->n_sets; b++) {
         if (!mpm_order_stretches(&sim->orders[b], &sim->grid, basis, sim->def->n_threads) ||
             !mpm_order_activate(&sim->orders[b], &sim->grid, basis)) {

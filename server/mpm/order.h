@@ -26,6 +26,7 @@ struct mpm_tile {
 struct mpm_stretch {
     uint32_t begin, end;  // particles
     uint32_t first, last; // the blocks of these, of the grid
+    uint32_t row;         // of blocks
 };
 
 #define MPM_APART 16  // numbers, so that what lies between shares no cache line
@@ -52,9 +53,8 @@ struct mpm_order {
     // Never depends on the number of threads: sums go by chunks.
     uint32_t *chunk; // (n_chunks + 1) first stretch of each, and n_stretches
     size_t n_chunks;
-    atomic_uint *done; // (n_stretches + parts * MPM_APART) the pass in which one was last done
+    atomic_uint *done; // (n_stretches + parts * MPM_APART) the pass that has last done one
     size_t n_flags;    // room in `done`
-    unsigned pass;
     // The stretches in parts of chunks, each in an order that keeps what they wait for and is near
     // that of memory.
     uint32_t *share;
@@ -85,7 +85,8 @@ bool mpm_order_sort(struct mpm_order *order, struct mpm_particles *s, const stru
 // for n_threads parts. False when memory is short.
 bool mpm_order_stretches(struct mpm_order *order, const struct mpm_grid *grid, enum mpm_basis basis,
                          int n_threads);
-// The chunk before which there is about a share (0 to 1) of the body's work.
+// The chunk before which there is about a share (0 to 1) of the body's work; where a row begins, if
+// one does near there.
 size_t mpm_order_cut(const struct mpm_order *order, double share);
 // Shares the stretches out in n parts, of which part k begins with chunk parts[k], and n ends the
 // last.

@@ -436,10 +436,11 @@ enum mpm_status mpm_create(const struct mpm_def *def, struct mpm_sim **out, stru
         }
         return first.status;
     }
-    struct mpm_sim *sim = calloc(1, sizeof *sim);
+    struct mpm_sim *sim = aligned_alloc(64, sizeof *sim);
     if (!sim) {
         return mpm_fail(err, MPM_ERR_MEMORY, "", "no memory for the simulation");
     }
+    memset(sim, 0, sizeof *sim);
     sim->def = def;
     sim->isa = mpm_isa_in_use(def->isa);
     sim->kernels = mpm_kernels(def->dimension, def->basis, sim->isa);

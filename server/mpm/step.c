@@ -59,7 +59,8 @@ static void share_out(struct mpm_sim *sim) {
         double before = 0;
         most = sim->sets[b].n > sim->sets[most].n ? b : most;
         for (int k = 0; k < n; k++) {
-            parts[k] = (uint32_t)mpm_order_cut(order, before);
+            const uint32_t cut = (uint32_t)mpm_order_cut(order, before);
+            parts[k] = k > 0 && cut < parts[k - 1] ? parts[k - 1] : cut;
             before += sim->turns[k].share;
         }
         parts[n] = (uint32_t)order->n_chunks;
@@ -94,7 +95,7 @@ static void clear_sums(void *context, int own, int there) {
 
 // What walls have in common is done by one thread: no other touches it before the barrier.
 static void move_nodes(void *context, int own, int there) {
-    const struct nodes_work *w = context;
+    const struct nodes_work copy = *(const struct nodes_work *)context, *w = &copy;
     struct mpm_sim *sim = w->sim;
     struct mpm_grid *grid = &sim->grid;
     const double *g = w->motion.gravity, dt = w->motion.dt;
@@ -171,6 +172,7 @@ struct particles_work {
     span_work *work;
     size_t body;
     int pass;              // of the step, from 0; a body's own
+    unsigned number;       // that no pass before had, of those that add to the grid
     const uint32_t *parts; // (n_parts + 1) first chunk of each
     int n_parts;           // one a thread
     bool clears_sums;      // which nobody will read any more
@@ -190,7 +192,11 @@ static void work_on(const struct particles_work *w, size_t begin, size_t end, si
     }
 }
 
+// A thread takes over from another only while much of its part is left, as when it lost its core:
+// what lies in another core's cache takes longer to fetch than to work on. Of a few it takes none:
+// what the other is at keeps it as long as they would, and to ask takes time, too.
 #define MUCH 3 // one of so many parts is
+#define FEW 32 // stretches or chunks of a part
 
 // A part's next stretch or chunk in the lower half of its turn, the end in the upper one. Its own
 // thread sets it as it begins; until then, as at the end of all work, nothing is left.
@@ -198,8 +204,7 @@ static void begin_turn(struct mpm_turn *turn, size_t begin, size_t end) {
     atomic_store_explicit(&turn->next, (uint64_t)end << 32 | begin, memory_order_release);
 }
 
-// The next of a part, if there is one. Of another's part only while much of it is left, as when its
-// thread lost its core: what lies in another core's cache takes longer to fetch than to work on.
+// The next of a part of n, if there is one.
 static bool take(struct mpm_turn *turn, bool own, size_t n, size_t *next) {
     if (!own) {
         const uint64_t now = atomic_load_explicit(&turn->next, memory_order_relaxed);
@@ -210,6 +215,16 @@ static bool take(struct mpm_turn *turn, bool own, size_t n, size_t *next) {
     const uint64_t now = atomic_fetch_add_explicit(&turn->next, 1, memory_order_acquire);
     *next = now & UINT32_MAX;
     return *next < now >> 32;
+}
+
+// The next of a part [begin, end), `own` or another's; *at goes through an own part of a few.
+static bool next_of_part(struct mpm_turn *turn, bool own, size_t begin, size_t end, size_t *at,
+                         size_t *next) {
+    if (end - begin >= FEW) {
+        return take(turn, own, end - begin, next);
+    }
+    *next = own ? (*at)++ : end;
+    return *next < end;
 }
 
 static double now_or_zero(const struct mpm_sim *sim) {
@@ -268,7 +283,7 @@ static void join_found(const struct mpm_sim *sim, struct mpm_span_result *joined
 // are being done there, the first waits for none that is, and a part's next is always done or taken
 // by the one whose part it is.
 static void work_on_stretches(void *context, int own, int there) {
-    const struct particles_work *w = context;
+    const struct particles_work copy = *(const struct particles_work *)context, *w = &copy;
     const struct mpm_order *order = w->order;
     struct mpm_team *team = w->sim->team;
     struct mpm_span_result found = mpm_nothing_found();
@@ -278,16 +293,17 @@ static void work_on_stretches(void *context, int own, int there) {
         const int part = (own + k) % w->n_parts;
         struct mpm_turn *turn = &w->sim->turns[part];
         const size_t begin = order->chunk[w->parts[part]], end = order->chunk[w->parts[part + 1]];
-        if (k == 0) {
+        if (k == 0 && end - begin >= FEW) {
             begin_turn(turn, begin, end);
         }
-        for (size_t i; take(turn, k == 0, end - begin, &i);) {
+        size_t at = begin;
+        for (size_t i; next_of_part(turn, k == 0, begin, end, &at, &i);) {
             const uint32_t t = order->share[i], next = order->share[i + 1 < end ? i + 1 : i];
             for (uint32_t q = order->before_begin[t]; there > 1 && q < order->before_begin[t + 1];
                  q++) {
                 atomic_uint *done = &order->done[order->flag[order->before[q]]];
                 for (unsigned pass;
-                     (pass = atomic_load_explicit(done, memory_order_acquire)) != order->pass;) {
+                     (pass = atomic_load_explicit(done, memory_order_acquire)) != w->number;) {
                     const double waits = now_or_zero(w->sim);
                     mpm_team_await(team, done, pass);
                     since += now_or_zero(w->sim) - waits;
@@ -298,17 +314,12 @@ static void work_on_stretches(void *context, int own, int there) {
             work += order->stretch[t].end - order->stretch[t].begin;
             if (there > 1) {
                 atomic_uint *done = &order->done[order->flag[t]];
-                atomic_store_explicit(done, order->pass, memory_order_release);
+                atomic_store_explicit(done, w->number, memory_order_release);
                 mpm_team_tell(team, done);
             }
         }
     }
     end_turn(w, own, &found, work, since);
-}
-
-static void for_stretches(struct particles_work *w) {
-    w->order->pass++;
-    mpm_team_run(w->sim->team, work_on_stretches, w);
 }
 
 // In whole blocks of particles: of one that two stretches share no lane is idle.
@@ -319,7 +330,7 @@ static size_t chunk_begin(const struct mpm_order *order, size_t chunk) {
 // All other work goes by chunks, in the same parts. They do not take equal time, since what flows
 // costs more.
 static void work_on_chunks(void *context, int own, int there) {
-    const struct particles_work *w = context;
+    const struct particles_work copy = *(const struct particles_work *)context, *w = &copy;
     const struct mpm_order *order = w->order;
     const size_t n = w->span.s->n;
     if (w->clears_sums) {
@@ -332,10 +343,11 @@ static void work_on_chunks(void *context, int own, int there) {
         const int part = (own + k) % w->n_parts;
         struct mpm_turn *turn = &w->sim->turns[part];
         const size_t first = w->parts[part], last = w->parts[part + 1];
-        if (k == 0) {
+        if (k == 0 && last - first >= FEW) {
             begin_turn(turn, first, last);
         }
-        for (size_t i; take(turn, k == 0, last - first, &i);) {
+        size_t at = first;
+        for (size_t i; next_of_part(turn, k == 0, first, last, &at, &i);) {
             const size_t end = i + 1 < order->n_chunks ? chunk_begin(order, i + 1) : n;
             work_on(w, chunk_begin(order, i), end, end < n ? end : 0, &found, w->sim->mass_dx[i]);
             work += end - chunk_begin(order, i);
@@ -346,8 +358,8 @@ static void work_on_chunks(void *context, int own, int there) {
 
 // Work that adds to the grid, or that moves particles: then with m dx of these, in the order of the
 // chunks. What else was found stays with the threads until the step is over.
-static void for_particles(const struct mpm_sim *sim, size_t body, struct particles_work w,
-                          bool adds, int *pass, double *mass_dx) {
+static void for_particles(struct mpm_sim *sim, size_t body, struct particles_work w, bool adds,
+                          int *pass, double *mass_dx) {
     const struct mpm_particles *s = w.span.s = &sim->sets[body];
     w.span.grid = (struct mpm_grid *)&sim->grid;
     w.sim = sim;
@@ -360,7 +372,8 @@ static void for_particles(const struct mpm_sim *sim, size_t body, struct particl
     w.parts = parts_of(sim, body);
     w.n_parts = sim->team->n_there;
     if (adds) {
-        for_stretches(&w);
+        w.number = ++sim->pass;
+        mpm_team_run(sim->team, work_on_stretches, &w);
         return;
     }
     mpm_team_run(sim->team, work_on_chunks, &w);
@@ -539,10 +552,10 @@ static bool sort_is_due(const struct mpm_sim *sim) {
 static void particles_to_grid(struct mpm_sim *sim, double dt, bool any_fbar, int *pass,
                               double *clock) {
     share_out(sim);
-    if (!sim->grid.sums_are_clear) {
+    if (!sim->sums_are_clear) {
         mpm_team_run(sim->team, clear_sums, sim);
     }
-    sim->grid.sums_are_clear = false;
+    sim->sums_are_clear = false;
     for (size_t b = 0; b < sim->n_sets; b++) {
         const struct mpm_span span = {.dt = dt, .fbar = any_fbar && sim->sets[b].wants_fbar};
         for_particles(sim, b, (struct particles_work){.span = span, .work = p2g}, true, pass, NULL);
@@ -603,7 +616,9 @@ static enum mpm_status step(struct mpm_sim *sim, struct mpm_error *err) {
     // P2G, eqs. 7, 8, 10
     const enum mpm_fbar_scheme scheme = now->fbar.scheme;
     const bool any_fbar = takes_part_in_fbar(sim);
-    sim->grid.fbar_stride = mpm_fbar_scalars(scheme);
+    if (sim->grid.fbar_stride != mpm_fbar_scalars(scheme)) {
+        sim->grid.fbar_stride = mpm_fbar_scalars(scheme);
+    }
     int pass = 0;
     particles_to_grid(sim, dt, any_fbar, &pass, &clock);
 
@@ -648,7 +663,7 @@ static enum mpm_status step(struct mpm_sim *sim, struct mpm_error *err) {
         }
         charge(sim, MPM_PHASE_FBAR, &clock);
     }
-    sim->grid.sums_are_clear = true;
+    sim->sums_are_clear = true;
     if (pass > 0) {
         join_found(sim, &found);
     }

@@ -1,5 +1,6 @@
 // Stretches of particles, the units of the work that adds to the grid: what each has to wait for,
 // and which thread does which, when.
+#include <math.h>
 #include <stdlib.h>
 #include <string.h>
 
@@ -8,7 +9,9 @@
 
 #define SHORTEST (2 * MPM_BATCH) // particles
 #define LONGEST 512              // in a body of many
-#define STRETCH_WORK 12 // particles' worth of what a stretch costs besides, for sharing work out
+// For sharing work out: what these cost besides, as particles.
+#define STRETCH_WORK 12
+#define CUT_WORK 256 // a cut within a row, where each of the parts then waits for the other
 
 void mpm_order_free(struct mpm_order *order) {
     free(order->tile);
@@ -68,9 +71,6 @@ static bool reserve_stretches(struct mpm_order *order, size_t n) {
 static uint32_t blocks_of_row(const struct mpm_grid *grid) {
     return (uint32_t)grid->n_blocks[grid->dim - 1];
 }
-static uint32_t row_of(const struct mpm_grid *grid, const struct mpm_stretch *stretch) {
-    return stretch->first / blocks_of_row(grid);
-}
 
 // Stencils of particles that are in blocks so far apart reach no common node: a stencil of 3 nodes,
 // from one cell before the block to one behind it, ends in the second node of the next block; one
@@ -107,7 +107,7 @@ static bool find_stretches(struct mpm_order *order, const struct mpm_grid *grid,
             if (!reserve_stretches(order, order->n_stretches + 1)) {
                 return false;
             }
-            struct mpm_stretch stretch = {.begin = begin, .end = past};
+            struct mpm_stretch stretch = {.begin = begin, .end = past, .row = row};
             if (k > 0) {
                 stretch.begin = order->stretch[order->n_stretches - 1].end;
             }
@@ -158,16 +158,16 @@ static void find_before(struct mpm_order *order, const struct mpm_grid *grid, co
             continue;
         }
         // Places in that row, as blocks: those of the own row's, moved.
-        const int64_t row = row_of(grid, own) + distance, width = blocks_of_row(grid);
+        const int64_t row = own->row + distance, width = blocks_of_row(grid);
         const int64_t move = distance * width;
         const int64_t from = own->first + move - (apart - 1), to = own->last + move + (apart - 1);
-        while (other < order->n_stretches && (row_of(grid, &order->stretch[other]) < row ||
-                                              (row_of(grid, &order->stretch[other]) == row &&
-                                               order->stretch[other].last < from))) {
+        while (other < order->n_stretches &&
+               (order->stretch[other].row < row ||
+                (order->stretch[other].row == row && order->stretch[other].last < from))) {
             other++;
         }
         for (size_t q = other; q < order->n_stretches && order->stretch[q].first <= to &&
-                               row_of(grid, &order->stretch[q]) == row;
+                               order->stretch[q].row == row;
              q++) {
             if (!comes_before(order, q, t)) {
                 continue;
@@ -251,23 +251,27 @@ static uint64_t work_before_chunk(const struct mpm_order *order, size_t chunk) {
     return order->work_before[order->chunk[chunk]];
 }
 
+static bool begins_row(const struct mpm_order *order, size_t chunk) {
+    const size_t t = order->chunk[chunk];
+    return t == 0 || t == order->n_stretches || order->stretch[t].row != order->stretch[t - 1].row;
+}
+
 size_t mpm_order_cut(const struct mpm_order *order, double share) {
     if (order->n_stretches == 0) {
         return 0;
     }
     const double wanted = share * (double)order->work_before[order->n_stretches];
-    size_t lo = 0, hi = order->n_chunks;
-    while (lo < hi) { // the first chunk with at least so much before it
-        const size_t middle = lo + (hi - lo) / 2;
-        if ((double)work_before_chunk(order, middle) < wanted) {
-            lo = middle + 1;
-        } else {
-            hi = middle;
+    size_t best = 0;
+    double least = INFINITY;
+    for (size_t chunk = 0; chunk <= order->n_chunks; chunk++) {
+        const double off = fabs((double)work_before_chunk(order, chunk) - wanted);
+        const double cost = begins_row(order, chunk) ? off : off + CUT_WORK;
+        if (cost < least) {
+            least = cost;
+            best = chunk;
         }
     }
-    const bool nearer = lo > 0 && wanted - (double)work_before_chunk(order, lo - 1) <
-                                      (double)work_before_chunk(order, lo) - wanted;
-    return nearer ? lo - 1 : lo;
+    return best;
 }
 
 // When a part comes to a stretch: first those that other parts wait for, last those that wait for
@@ -377,7 +381,7 @@ void mpm_order_share(struct mpm_order *order, const uint32_t *parts, int n) {
         share_by_colour(order, begin, end, LAST, at);
         for (size_t i = begin; i < end; i++) {
             order->flag[order->share[i]] = (uint32_t)(i + (size_t)k * MPM_APART);
-            atomic_init(&order->done[i + (size_t)k * MPM_APART], order->pass);
+            atomic_init(&order->done[i + (size_t)k * MPM_APART], 0);
         }
     }
 }

@@ -95,8 +95,8 @@ static void check_shares(struct mpm_order *order, int n_parts) {
     uint32_t parts[9], next[8];
     bool *done = calloc(order->n_stretches + 1, sizeof *done);
     for (int k = 0; k <= n_parts; k++) {
-        parts[k] = k == n_parts ? (uint32_t)order->n_chunks
-                                : (uint32_t)mpm_order_cut(order, (double)k / n_parts);
+        const uint32_t cut = (uint32_t)mpm_order_cut(order, (double)k / n_parts);
+        parts[k] = k > 0 && cut < parts[k - 1] ? parts[k - 1] : cut;
     }
     mpm_order_share(order, parts, n_parts);
     for (int k = 0; k < n_parts; k++) {
