@@ -33,6 +33,10 @@ struct mpm_stretch {
 #define MPM_FEWEST 64 // particles of a chunk, and 1/32 of the body's up to MPM_MOST
 #define MPM_MOST 512
 
+// When a part comes to a stretch: first those that other parts wait for, last those that wait for
+// other parts, each with what has to come before or after it.
+enum mpm_when { MPM_BETWEEN, MPM_FIRST, MPM_LAST, MPM_PLACED };
+
 struct mpm_order {
     size_t n_tiles, tile_capacity;
     struct mpm_tile *tile; // by block
@@ -59,7 +63,7 @@ struct mpm_order {
     // that of memory.
     uint32_t *share;
     uint32_t *flag; // (n_stretches) where in `done`: a part's side by side, for who waits for many
-    uint8_t *when;  // (n_stretches) for sharing out
+    uint8_t *when;  // (n_stretches) enum mpm_when
 };
 
 // Memory for sorting any body of up to n particles.

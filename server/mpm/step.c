@@ -175,6 +175,7 @@ struct particles_work {
     unsigned number;       // that no pass before had, of those that add to the grid
     const uint32_t *parts; // (n_parts + 1) first chunk of each
     int n_parts;           // one a thread
+    bool gathers;          // from the grid, before it adds to it
     bool clears_sums;      // which nobody will read any more
 };
 
@@ -276,6 +277,33 @@ static void join_found(const struct mpm_sim *sim, struct mpm_span_result *joined
     }
 }
 
+static void lines_ahead(const double *array, uint32_t slot, size_t doubles, const bool writes) {
+    for (size_t i = 0; i < doubles; i += 8) {
+        if (writes) {
+            __builtin_prefetch(array + slot * doubles + i, 1);
+        } else {
+            __builtin_prefetch(array + slot * doubles + i, 0);
+        }
+    }
+}
+
+// The nodes of a stretch's blocks on the way to the cache: of one that waits for another part,
+// which has changed many of them.
+static void nodes_ahead(const struct particles_work *w, uint32_t t) {
+    const struct mpm_grid *g = &w->sim->grid;
+    const struct mpm_stretch *stretch = &w->order->stretch[t];
+    const size_t nodes = (size_t)MPM_BLOCK_NODES(g->dim);
+    for (uint32_t block = stretch->first; block <= stretch->last; block++) {
+        const uint32_t slot = g->slot[block];
+        if (slot > 0 && w->gathers) {
+            lines_ahead(g->fbar, slot, nodes * (size_t)g->fbar_stride, true);
+            lines_ahead(g->velocity, slot, nodes * (size_t)MPM_VELOCITY(g->dim), false);
+        } else if (slot > 0) {
+            lines_ahead(g->node, slot, nodes * MPM_NODE, true);
+        }
+    }
+}
+
 // Work that adds to the grid goes by stretches. One waits for those near it that come before it, so
 // that every node's sum has one order whatever the number of threads (order.h). Each thread does
 // its own part first, then what others are far from. Nobody waits for one that nobody will do:
@@ -308,6 +336,9 @@ static void work_on_stretches(void *context, int own, int there) {
                     mpm_team_await(team, done, pass);
                     since += now_or_zero(w->sim) - waits;
                 }
+            }
+            if (there > 1 && next != t && order->when[next] == MPM_LAST) {
+                nodes_ahead(w, next);
             }
             work_on(w, order->stretch[t].begin, order->stretch[t].end, order->stretch[next].begin,
                     &found, NULL);
@@ -349,7 +380,8 @@ static void work_on_chunks(void *context, int own, int there) {
         size_t at = first;
         for (size_t i; next_of_part(turn, k == 0, first, last, &at, &i);) {
             const size_t end = i + 1 < order->n_chunks ? chunk_begin(order, i + 1) : n;
-            work_on(w, chunk_begin(order, i), end, end < n ? end : 0, &found, w->sim->mass_dx[i]);
+            const size_t next = chunk_begin(order, i + 1 < last ? i + 1 : first);
+            work_on(w, chunk_begin(order, i), end, next, &found, w->sim->mass_dx[i]);
             work += end - chunk_begin(order, i);
         }
     }
@@ -645,7 +677,7 @@ static enum mpm_status step(struct mpm_sim *sim, struct mpm_error *err) {
                                       .C = now->fbar.C,
                                       .keep = now->fbar.keep};
         const struct particles_work work = {
-            .span = span, .work = g2p, .clears_sums = !any_fbar && b == 0};
+            .span = span, .work = g2p, .gathers = true, .clears_sums = !any_fbar && b == 0};
         for_particles(sim, b, work, averaged, &pass, mass_dx);
     }
     charge(sim, MPM_PHASE_G2P, &clock);

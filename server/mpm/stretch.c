@@ -274,32 +274,28 @@ size_t mpm_order_cut(const struct mpm_order *order, double share) {
     return best;
 }
 
-// When a part comes to a stretch: first those that other parts wait for, last those that wait for
-// other parts, each with what has to come before or after it.
-enum when { BETWEEN, FIRST, LAST, PLACED };
-
-// Marks what t waits for FIRST if it is, or t LAST if what it waits for is.
+// Marks what t waits for MPM_FIRST if it is, or t MPM_LAST if what it waits for is.
 static void spread(struct mpm_order *order, size_t t, size_t begin, size_t end, bool first) {
     for (uint32_t b = order->before_begin[t]; b < order->before_begin[t + 1]; b++) {
         const uint32_t q = order->before[b];
-        if (first && order->when[t] == FIRST && q >= begin && q < end) {
-            order->when[q] = FIRST;
-        } else if (!first && order->when[q] == LAST && order->when[t] != FIRST) {
-            order->when[t] = LAST;
+        if (first && order->when[t] == MPM_FIRST && q >= begin && q < end) {
+            order->when[q] = MPM_FIRST;
+        } else if (!first && order->when[q] == MPM_LAST && order->when[t] != MPM_FIRST) {
+            order->when[t] = MPM_LAST;
         }
     }
 }
 
 static void find_first_and_last(struct mpm_order *order, const uint32_t *parts, int n) {
-    memset(order->when, BETWEEN, order->n_stretches);
+    memset(order->when, MPM_BETWEEN, order->n_stretches);
     for (int k = 0; k < n; k++) {
         const size_t begin = order->chunk[parts[k]], end = order->chunk[parts[k + 1]];
         for (size_t t = begin; t < end; t++) {
             for (uint32_t b = order->before_begin[t]; b < order->before_begin[t + 1]; b++) {
                 const uint32_t q = order->before[b];
                 if (q < begin || q >= end) {
-                    order->when[q] = FIRST;
-                    order->when[t] = order->when[t] == FIRST ? FIRST : LAST;
+                    order->when[q] = MPM_FIRST;
+                    order->when[t] = order->when[t] == MPM_FIRST ? MPM_FIRST : MPM_LAST;
                 }
             }
         }
@@ -325,7 +321,7 @@ static void find_first_and_last(struct mpm_order *order, const uint32_t *parts, 
 
 // The stretches of a part that are done at a time, by colour; shared out from `at` on. Returns
 // where they end.
-static size_t share_by_colour(struct mpm_order *order, size_t begin, size_t end, enum when when,
+static size_t share_by_colour(struct mpm_order *order, size_t begin, size_t end, enum mpm_when when,
                               size_t at) {
     for (int colour = 0; colour < order->n_colours; colour++) {
         for (size_t t = begin; t < end; t++) {
@@ -340,7 +336,7 @@ static size_t share_by_colour(struct mpm_order *order, size_t begin, size_t end,
 // What a stretch waits for that is not yet placed, or itself.
 static uint32_t first_of(const struct mpm_order *order, uint32_t t) {
     for (uint32_t b = order->before_begin[t]; b < order->before_begin[t + 1]; b++) {
-        if (order->when[order->before[b]] == BETWEEN) {
+        if (order->when[order->before[b]] == MPM_BETWEEN) {
             return order->before[b];
         }
     }
@@ -357,7 +353,7 @@ static size_t share_in_place(struct mpm_order *order, uint32_t t, size_t at, siz
         if (next != now) {
             order->share[--top] = next;
         } else {
-            order->when[now] = PLACED;
+            order->when[now] = MPM_PLACED;
             top++;
             order->share[at++] = now;
         }
@@ -372,13 +368,13 @@ void mpm_order_share(struct mpm_order *order, const uint32_t *parts, int n) {
     find_first_and_last(order, parts, n);
     for (int k = 0; k < n; k++) {
         const size_t begin = order->chunk[parts[k]], end = order->chunk[parts[k + 1]];
-        size_t at = share_by_colour(order, begin, end, FIRST, begin);
+        size_t at = share_by_colour(order, begin, end, MPM_FIRST, begin);
         for (size_t t = begin; t < end; t++) {
-            if (order->when[t] == BETWEEN) {
+            if (order->when[t] == MPM_BETWEEN) {
                 at = share_in_place(order, (uint32_t)t, at, end);
             }
         }
-        share_by_colour(order, begin, end, LAST, at);
+        share_by_colour(order, begin, end, MPM_LAST, at);
         for (size_t i = begin; i < end; i++) {
             order->flag[order->share[i]] = (uint32_t)(i + (size_t)k * MPM_APART);
             atomic_init(&order->done[i + (size_t)k * MPM_APART], 0);
