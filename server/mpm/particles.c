@@ -35,6 +35,18 @@ static void list(struct mpm_particles *s, unsigned wanted, struct array *arrays)
     memcpy(arrays, all, sizeof all);
 }
 
+// Processors fetch what lies ahead, past the end of an array too: of the next array the first
+// particles, which another thread may have just changed and then has to fetch back. So there is
+// room for that between the arrays of bodies that threads share.
+#define AHEAD 33 // cache lines; not whole pages, of which all would begin in one set of the cache
+#define SHARED 1024 // particles or more; does not depend on the threads, as a saved state does not
+
+static size_t array_bytes(size_t capacity, int components) {
+    return components > 0 ? capacity * (size_t)components * sizeof(double) +
+                                (capacity >= SHARED ? AHEAD * 64 : 0)
+                          : 0;
+}
+
 // One walk over all fields serves counting (base NULL) and carving.
 static size_t carve(struct mpm_particles *s, char *base, unsigned wanted) {
     struct array fields[N_ARRAYS];
@@ -44,7 +56,7 @@ static size_t carve(struct mpm_particles *s, char *base, unsigned wanted) {
         if (base) {
             *fields[k].field = fields[k].components ? (double *)(base + bytes) : NULL;
         }
-        bytes += s->capacity * (size_t)fields[k].components * sizeof(double);
+        bytes += array_bytes(s->capacity, fields[k].components);
     }
     uint32_t **const numbers[] = {&s->id, wanted & MPM_WANTS_PLACES ? &s->at : NULL};
     for (size_t k = 0; k < sizeof numbers / sizeof *numbers; k++) {
@@ -72,7 +84,7 @@ static size_t whole_blocks(size_t n) {
 }
 
 static size_t fbar_bytes(int dim, size_t capacity) {
-    return capacity * (size_t)(dim + 1) * sizeof(double);
+    return array_bytes(capacity, dim) + array_bytes(capacity, 1);
 }
 
 bool mpm_particles_create(struct mpm_particles *s, size_t n, unsigned wanted) {
@@ -118,7 +130,7 @@ bool mpm_particles_add_fbar(struct mpm_particles *s) {
     }
     s->fbar_bytes = bytes;
     s->dx = s->fbar_memory;
-    s->dJ = s->dx + s->capacity * (size_t)s->dim;
+    s->dJ = s->dx + array_bytes(s->capacity, s->dim) / sizeof(double);
     return true;
 }
 
