@@ -580,6 +580,22 @@ static bool sort_is_due(const struct mpm_sim *sim) {
             0.5 * steps * broken * RUN_COST > SORT_COST * (double)sim->n_particles);
 }
 
+static bool has_active_load(const struct mpm_sim *sim) {
+    bool any = false;
+    for (size_t k = 0; k < sim->n_loads; k++) {
+        any |= sim->loads[k].active;
+    }
+    return any;
+}
+
+static bool has_active_rigid(const struct mpm_sim *sim) {
+    bool any = false;
+    for (size_t k = 0; k < sim->n_rigids; k++) {
+        any |= sim->rigids[k].active;
+    }
+    return any;
+}
+
 // eqs. 7, 8, 10, and the forces of loads and rigid bodies.
 static void particles_to_grid(struct mpm_sim *sim, double dt, bool any_fbar, int *pass,
                               double *clock) {
@@ -613,7 +629,7 @@ static void particles_to_grid(struct mpm_sim *sim, double dt, bool any_fbar, int
             mpm_contact_forces(rigid, sim->plain, &sim->sets[b], &sim->orders[b], &sim->grid, dt);
         }
     }
-    if (sim->n_loads + sim->n_rigids > 0) {
+    if (has_active_load(sim) || has_active_rigid(sim)) {
         charge(sim, MPM_PHASE_CONTACT, clock);
     }
 }
@@ -704,7 +720,7 @@ static enum mpm_status step(struct mpm_sim *sim, struct mpm_error *err) {
     sim->c.runs_at_sort = sim->c.steps_since_sort == 0 ? found.n_runs : sim->c.runs_at_sort;
 
     enum mpm_status status = check_result(sim, &found, time, err);
-    if (!status && sim->n_rigids > 0) {
+    if (!status && has_active_rigid(sim)) {
         move_rigid_bodies(sim, dt, &found);
         status = check_result(sim, &found, time, err); // none was pushed out of the domain
         charge(sim, MPM_PHASE_CONTACT, &clock);
