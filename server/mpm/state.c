@@ -108,6 +108,12 @@ enum mpm_status mpm_state_load(struct mpm_sim *sim, const void *in, size_t bytes
     if (bytes >= sizeof theirs) {
         memcpy(&theirs, in, sizeof theirs);
     }
+    if (bytes >= sizeof theirs && theirs.magic != mine.magic) {
+        return mpm_fail(err, MPM_ERR_STATE, "",
+                        "the saved state is of another build of the program, or of none: it begins "
+                        "with %016llx, expected %016llx",
+                        (unsigned long long)theirs.magic, (unsigned long long)mine.magic);
+    }
     struct reading rest = {.at = (const char *)in + sizeof mine, .end = (const char *)in + bytes};
     if (bytes < sizeof theirs || memcmp(&mine, &theirs, sizeof mine) != 0 ||
         !walk(sim, load, &rest) || rest.at != rest.end || !mpm_restore_order(sim)) {

@@ -246,7 +246,8 @@ static void test_state_that_does_not_fit_is_refused(void **state) {
     assert_int_equal(mpm_state_load(sim, saved, 0, NULL), MPM_ERR_STATE);
     assert_int_equal(mpm_state_load(sim, saved, 12, NULL), MPM_ERR_STATE);
     saved[0] ^= 1;
-    assert_int_equal(mpm_state_load(sim, saved, bytes, NULL), MPM_ERR_STATE);
+    assert_int_equal(mpm_state_load(sim, saved, bytes, &err), MPM_ERR_STATE);
+    assert_non_null(strstr(err.message, "another build"));
     saved[0] ^= 1;
     const struct view after = look(sim, 2);
     assert_memory_equal(before.memory, after.memory, before.bytes); // untouched
