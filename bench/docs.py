@@ -96,7 +96,7 @@ def main():
             elif "hours" in r:
                 print(f"- {r['scene']}: {r['particles']:,.0f} particles, {r['threads']:.0f} thread(s): {r['ns_per_particle_step']:.1f} ns, so {r['hours']:.2f} h for the whole (asked for: 1.5 h on two).")
             elif r["group"] == "meeting":
-                print(f"- {r['scene']}: parallel work that does nothing takes two threads {r['us_a_piece']:.2f} µs a piece, {r['pieces']:.0f} a step; a step on one thread {r['us_a_step_on_one_thread']:.0f} µs: two are at most {r['at_most_times_as_fast']:.2f} times as fast. A cache line took {r['line_there_and_back_ns']:.0f} ns to the other core and back.")  # fmt: skip
+                print(f"- {r['scene']}: a step in which no thread does anything takes two threads {r['us_an_empty_step']:.2f} µs to begin, to meet and to end; a step on one thread {r['us_a_step_on_one_thread']:.0f} µs: two are at most {r['at_most_times_as_fast']:.2f} times as fast. A cache line took {r['line_there_and_back_ns']:.0f} ns to the other core and back.")  # fmt: skip
         print()
         print(table(VERDICT_HEAD, map(verdict, (r for r in scenes if "what" in r))) + "\n")
 

@@ -93,22 +93,21 @@ static void share(const char *title, const char *name, const char *patch, const 
 
 // ---- What two threads need to meet ----
 
-#define PIECES 2000
+#define STEPS 2000
+#define MEETINGS 4 // of a step with F-bar, between its begin and its end
 
-static void nothing(void *context, int own, int there) {
-    (void)context;
-    (void)own;
-    (void)there;
+static void meetings(void *context, int own, int there) {
+    for (int k = 0; k < MEETINGS; k++) {
+        mpm_team_barrier(context, own, there);
+    }
 }
-static void pieces(void *context) {
-    for (int k = 0; k < PIECES; k++) {
-        mpm_team_run(context, nothing, NULL);
+static void steps_of_nothing(void *context) {
+    for (int k = 0; k < STEPS; k++) {
+        mpm_team_run(context, meetings, context);
     }
 }
 
-#define A_STEP 5 // pieces of parallel work of a step with F-bar
-
-// Parallel work begins and ends, with nothing in between: us.
+// Steps begin, meet and end, with nothing in between: us.
 static void meeting(const char *name, const char *patch, const void *state, size_t bytes) {
     struct run run = continue_scene(name, patch, 2, state, bytes);
     if (run.sim) {
@@ -117,25 +116,22 @@ static void meeting(const char *name, const char *patch, const void *state, size
         struct run one = continue_scene(name, patch, 1, state, bytes);
         for (int r = 0; r < rounds; r++) {
             const double t = wall_now();
-            mpm_team_hold(run.sim->team, pieces, run.sim->team);
-            us[r] = 1e6 * (wall_now() - t) / PIECES;
+            mpm_team_hold(run.sim->team, steps_of_nothing, run.sim->team);
+            us[r] = 1e6 * (wall_now() - t) / STEPS;
             step[r] = one.sim ? 1e6 * timed(one.sim, 0.02) * (double)mpm_n_particles(one.sim) : NAN;
         }
         close_run(&one);
-        const double piece = median(us, rounds), whole = median(step, rounds);
+        const double empty = median(us, rounds), whole = median(step, rounds);
         const double line = 1e9 * line_there_and_back();
-        printf("  a piece of parallel work that does nothing takes two threads %.2f us; %d a step: "
-               "%.1f us, "
-               "a step on one thread %.1f us: so at most %.2f times as fast; a cache line takes "
-               "%.0f ns "
-               "to the other core and back\n",
-               piece, A_STEP, A_STEP * piece, whole, whole / (whole / 2 + A_STEP * piece), line);
+        printf("  a step of which all parts do nothing takes two threads %.2f us, a step on one "
+               "thread %.1f us: so at most %.2f times as fast; a cache line takes %.0f ns to the "
+               "other core and back\n",
+               empty, whole, whole / (whole / 2 + empty), line);
         open_row("meeting");
         text("scene", name);
-        number("us_a_piece", piece);
-        number("pieces", A_STEP);
+        number("us_an_empty_step", empty);
         number("us_a_step_on_one_thread", whole);
-        number("at_most_times_as_fast", whole / (whole / 2 + A_STEP * piece));
+        number("at_most_times_as_fast", whole / (whole / 2 + empty));
         number("line_there_and_back_ns", line);
         close_row();
     }

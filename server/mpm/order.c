@@ -83,7 +83,7 @@ static void run_radix_pass(void *context, int own, int there) {
     for (size_t i = begin; i < end; i++) {
         count[(r->key[i] - r->least) >> r->shift & (N_DIGITS - 1)]++;
     }
-    mpm_team_barrier(r->team, there);
+    mpm_team_barrier(r->team, own, there);
     if (own == 0) {
         uint32_t sum = 0;
         for (int digit = 0; digit < N_DIGITS; digit++) {
@@ -94,7 +94,7 @@ static void run_radix_pass(void *context, int own, int there) {
             }
         }
     }
-    mpm_team_barrier(r->team, there);
+    mpm_team_barrier(r->team, own, there);
     for (size_t i = begin; i < end; i++) {
         const uint32_t to = count[(r->key[i] - r->least) >> r->shift & (N_DIGITS - 1)]++;
         r->key_out[to] = r->key[i];
@@ -117,7 +117,7 @@ static void move_components(void *context, int own, int there) {
         for (size_t p = begin; p < end; p++) {
             m->room[p] = m->field[mpm_at(m->from[p], m->components, c)];
         }
-        mpm_team_barrier(m->team, there); // the field is read
+        mpm_team_barrier(m->team, own, there); // the field is read
         for (size_t p = begin; p < end; p++) {
             m->field[mpm_at(p, m->components, c)] = m->room[p];
         }

@@ -33,9 +33,18 @@ struct mpm_stretch {
 #define MPM_FEWEST 64 // particles of a chunk, and 1/32 of the body's up to MPM_MOST
 #define MPM_MOST 512
 
-// When a part comes to a stretch: first those that other parts wait for, last those that wait for
-// other parts, each with what has to come before or after it.
-enum mpm_when { MPM_BETWEEN, MPM_FIRST, MPM_LAST, MPM_PLACED };
+// A thread's part of the stretches, while it is shared out.
+struct mpm_part {
+    size_t begin, end;     // stretches
+    size_t n_placed;       // from the begin of its `share` on
+    size_t n_tied;         // to other parts and not placed: up to the end of its `share`
+    size_t untied;         // before this all that are not tied are placed
+    uint64_t clock, looks; // work that it has done, and at which it looks for more
+};
+
+// Ties of a stretch to other parts, by itself or through stretches of its own part, as bits.
+#define MPM_AWAITED 1 // one there waits for it
+#define MPM_AWAITS 2  // it waits for one there
 
 struct mpm_order {
     size_t n_tiles, tile_capacity;
@@ -62,8 +71,11 @@ struct mpm_order {
     // The stretches in parts of chunks, each in an order that keeps what they wait for and is near
     // that of memory.
     uint32_t *share;
-    uint32_t *flag; // (n_stretches) where in `done`: a part's side by side, for who waits for many
-    uint8_t *when;  // (n_stretches) enum mpm_when
+    uint32_t *flag;  // (n_stretches) where in `done`: a part's side by side, for who waits for many
+    uint8_t *ties;   // (n_stretches)
+    uint64_t *ended; // (n_stretches) work at which one is over, as if all threads were as fast
+    struct mpm_part *parts; // (most_parts)
+    int most_parts;
 };
 
 // Memory for sorting any body of up to n particles.

@@ -492,7 +492,7 @@ enum mpm_status mpm_create(const struct mpm_def *def, struct mpm_sim **out, stru
     }
     sim->turns = aligned_alloc(128, (size_t)def->n_threads * sizeof *sim->turns);
     sim->team = mpm_team_create(def->n_threads);
-    sim->mass_dx = calloc(largest / MPM_FEWEST + 1, sizeof *sim->mass_dx);
+    sim->mass_dx = calloc(sim->n_particles / MPM_FEWEST + sim->n_sets, sizeof *sim->mass_dx);
     sim->parts = calloc(sim->n_sets * ((size_t)def->n_threads + 1), sizeof *sim->parts);
     sim->cut = calloc((size_t)def->n_threads + 1, sizeof *sim->cut);
     if (!sim->turns || !sim->team || !sim->mass_dx || !sim->cut || !sim->parts) {

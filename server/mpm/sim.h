@@ -55,6 +55,15 @@ struct mpm_turn {
     double speed, share; // particles a second before that, and its share of all work
 };
 
+// What threads do in a step, but for what changes from step to step.
+struct mpm_plan {
+    bool fbar;            // in force, and some body takes part
+    bool forces;          // of loads or rigid bodies
+    bool clears_sums;     // of the nodes, as after a sort
+    struct mpm_span span; // settings of the transfers
+    struct mpm_motion motion;
+};
+
 struct mpm_sim {
     const struct mpm_def *def; // borrowed
     enum mpm_isa isa;
@@ -74,7 +83,7 @@ struct mpm_sim {
     struct mpm_wall *walls;
     struct mpm_load *loads;
     struct mpm_rigid *rigids;
-    double (*mass_dx)[MPM_MAX_DIM]; // (chunks of the largest body) what each found, kg m
+    double (*mass_dx)[MPM_MAX_DIM]; // (chunks of all bodies) what each found, kg m
     struct mpm_average *averages;   // (n_probes), NULL where no probe averages
     size_t *probe_particle;         // (n_probes) set and id of the particle of a probe at a point
     size_t *probe_set;
@@ -82,10 +91,11 @@ struct mpm_sim {
     struct mpm_body_force *body_forces; // (n_sets), NULL without a body force
     double *scratch;                    // (n_particles), where a probe sorts
     struct mpm_smooth *smooth;          // owned
+    struct mpm_plan plan;
     // What one thread changes in every step, apart from what all read: to fetch a cache line again
     // takes longer than a node or ten particles.
     _Alignas(64) struct mpm_clockwork c;
-    double phase_seconds[MPM_N_PHASES];
+    double phase_seconds[MPM_N_PHASES], phase_begin;
     bool sums_are_clear; // grid.node: of all slots
     unsigned pass;       // number of the last pass that added to the grid
 };

@@ -5,7 +5,7 @@
 
 #include "server/mpm/sim.h"
 
-#define STATE_MAGIC 0x33746174534d504dULL // "MPMStat3"
+#define STATE_MAGIC 0x34746174534d504dULL // "MPMStat4"
 
 struct header {
     uint64_t magic, bytes, n_sets, n_walls, n_probes, n_stages, n_particles;

@@ -5,18 +5,18 @@
 #include <stdio.h>
 #include <string.h>
 
+#include "server/mpm/basis.h"
 #include "server/mpm/sim.h"
 
 #define UNSTABLE_CFL                                                                               \
     1.0 // no basis is stable at dt >= 0.9 h/c (docs/method.md): beyond this it is not tried
 
-// Work on nodes. Each thread has the blocks around its part of the particles, so that most of what
-// it adds to the grid, moves and gathers stays with it: to fetch what another core has just changed
-// takes longer than all else that is done with a node.
-struct nodes_work {
+// What a thread knows of a step.
+struct step_work {
     struct mpm_sim *sim;
-    struct mpm_motion motion;
-    bool fbar;
+    struct mpm_plan plan;
+    unsigned number; // of the last pass that added to the grid
+    int pass;        // of the step, from 0; a body's own
 };
 
 static uint32_t *parts_of(const struct mpm_sim *sim, size_t body) {
@@ -78,6 +78,10 @@ static void share_out(struct mpm_sim *sim) {
     sim->n_shared = n;
 }
 
+// Work on nodes. Each thread has the blocks around its part of the particles, so that most of what
+// it adds to the grid, moves and gathers stays with it: to fetch what another core has just changed
+// takes longer than all else that is done with a node.
+
 // A thread's share of an array of nodes, with slot 0, where no block is.
 static void clear(const struct mpm_sim *sim, double *array, int width, int own) {
     const size_t block = (size_t)MPM_BLOCK_NODES(sim->grid.dim) * (size_t)width;
@@ -87,50 +91,46 @@ static void clear(const struct mpm_sim *sim, double *array, int width, int own) 
 
 // The sums of a step are cleared for the next one as soon as they have been read, by who has them
 // in its cache: so this is work of its own only after a sort.
-static void clear_sums(void *context, int own, int there) {
-    const struct mpm_sim *sim = context;
-    (void)there;
+static void clear_sums(const struct mpm_sim *sim, int own) {
     clear(sim, sim->grid.node, MPM_NODE, own);
 }
 
 // What walls have in common is done by one thread: no other touches it before the barrier.
-static void move_nodes(void *context, int own, int there) {
-    const struct nodes_work copy = *(const struct nodes_work *)context, *w = &copy;
+static void move_nodes(const struct step_work *w, int own, int there) {
     struct mpm_sim *sim = w->sim;
     struct mpm_grid *grid = &sim->grid;
-    const double *g = w->motion.gravity, dt = w->motion.dt;
+    const double *g = w->plan.motion.gravity, dt = w->plan.motion.dt;
     const uint32_t first = sim->cut[own] > 0 ? sim->cut[own] : 1, last = sim->cut[own + 1];
     mpm_walls_fold(sim->walls, sim->n_walls, grid, g, dt, own);
     if (sim->walls_in_common) {
         if (own == 0) {
             mpm_walls_fold(sim->walls, sim->n_walls, grid, g, dt, there);
         }
-        mpm_team_barrier(sim->team, there);
+        mpm_team_barrier(sim->team, own, there);
     }
     if (first < last) {
-        sim->kernels->move_nodes(grid, first, last, &w->motion);
+        sim->kernels->move_nodes(grid, first, last, &w->plan.motion);
     }
-    if (w->fbar) {
+    if (w->plan.fbar) {
         clear(sim, grid->fbar, grid->fbar_stride, own);
     }
     mpm_walls_apply(sim->walls, sim->n_walls, grid, g, dt, own);
     if (sim->walls_in_common) {
-        mpm_team_barrier(sim->team, there);
+        mpm_team_barrier(sim->team, own, there);
         if (own == 0) {
             mpm_walls_apply(sim->walls, sim->n_walls, grid, g, dt, there);
         }
     }
 }
 
-static void divide_nodes(void *context, int own, int there) {
-    struct mpm_sim *sim = context;
+static void divide_nodes(struct mpm_sim *sim, int own, int there) {
     struct mpm_grid *grid = &sim->grid;
     mpm_walls_fold_fbar(sim->walls, sim->n_walls, grid, own);
     if (sim->walls_in_common) {
         if (own == 0) {
             mpm_walls_fold_fbar(sim->walls, sim->n_walls, grid, there);
         }
-        mpm_team_barrier(sim->team, there);
+        mpm_team_barrier(sim->team, own, there);
     }
     const uint32_t first = sim->cut[own] > 0 ? sim->cut[own] : 1, last = sim->cut[own + 1];
     if (first < last) {
@@ -139,7 +139,7 @@ static void divide_nodes(void *context, int own, int there) {
     clear(sim, grid->node, MPM_NODE, own);
     mpm_walls_mirror_fbar(sim->walls, sim->n_walls, grid, own);
     if (sim->walls_in_common) {
-        mpm_team_barrier(sim->team, there);
+        mpm_team_barrier(sim->team, own, there);
         if (own == 0) {
             mpm_walls_mirror_fbar(sim->walls, sim->n_walls, grid, there);
         }
@@ -167,16 +167,17 @@ typedef void span_work(const struct mpm_sim *sim, const struct mpm_span *span,
 
 struct particles_work {
     const struct mpm_sim *sim;
-    struct mpm_order *order;
+    const struct mpm_order *order;
     struct mpm_span span;
     span_work *work;
     size_t body;
-    int pass;              // of the step, from 0; a body's own
-    unsigned number;       // that no pass before had, of those that add to the grid
-    const uint32_t *parts; // (n_parts + 1) first chunk of each
-    int n_parts;           // one a thread
-    bool gathers;          // from the grid, before it adds to it
-    bool clears_sums;      // which nobody will read any more
+    int pass;                       // of the step, from 0; a body's own
+    unsigned number;                // that no pass before had, of those that add to the grid
+    const uint32_t *parts;          // (n_parts + 1) first chunk of each
+    int n_parts;                    // one a thread
+    double (*mass_dx)[MPM_MAX_DIM]; // of the body's chunks
+    bool gathers;                   // from the grid, before it adds to it
+    bool clears_sums;               // which nobody will read any more
 };
 
 static void work_on(const struct particles_work *w, size_t begin, size_t end, size_t next,
@@ -256,7 +257,12 @@ static void end_turn(const struct particles_work *w, int own, struct mpm_span_re
     }
 }
 
-// What all have found in the step: of faults the first pass' first, by its particle's id.
+static double (*mass_dx_of(const struct mpm_sim *sim, size_t body))[MPM_MAX_DIM] {
+    return sim->mass_dx + sim->sets[body].first_id / MPM_FEWEST + body;
+}
+
+// What all have found in the step: of faults the first pass' first, by its particle's id; and the
+// sums, in the order of the chunks.
 static void join_found(const struct mpm_sim *sim, struct mpm_span_result *joined) {
     int pass = 0;
     size_t body = 0;
@@ -275,45 +281,95 @@ static void join_found(const struct mpm_sim *sim, struct mpm_span_result *joined
     if (joined->bad != SIZE_MAX) {
         joined->bad = sim->sets[body].first_id + sim->sets[body].id[joined->bad];
     }
-}
-
-static void lines_ahead(const double *array, uint32_t slot, size_t doubles, const bool writes) {
-    for (size_t i = 0; i < doubles; i += 8) {
-        if (writes) {
-            __builtin_prefetch(array + slot * doubles + i, 1);
-        } else {
-            __builtin_prefetch(array + slot * doubles + i, 0);
+    for (size_t b = 0; b < sim->n_sets; b++) {
+        for (size_t k = 0; k < sim->orders[b].n_chunks; k++) {
+            for (int d = 0; d < sim->grid.dim; d++) {
+                joined->mass_dx[d] += mass_dx_of(sim, b)[k][d];
+            }
         }
     }
 }
 
-// The nodes of a stretch's blocks on the way to the cache: of one that waits for another part,
-// which has changed many of them.
-static void nodes_ahead(const struct particles_work *w, uint32_t t) {
+static void lines_ahead(const double *array, size_t doubles, bool writes) {
+    for (size_t i = 0; i < doubles; i += 8) {
+        if (writes) {
+            mpm_prefetch_to_write(array + i);
+        } else {
+            __builtin_prefetch(array + i);
+        }
+    }
+}
+
+// Nodes that other threads have just changed on the way to the cache, of a stretch that is tied to
+// their parts: those that are theirs, and, if it waits for them, those of its blocks.
+static void nodes_ahead(const struct particles_work *w, uint32_t t, int own) {
     const struct mpm_grid *g = &w->sim->grid;
     const struct mpm_stretch *stretch = &w->order->stretch[t];
-    const size_t nodes = (size_t)MPM_BLOCK_NODES(g->dim);
+    const uint32_t nodes = (uint32_t)MPM_BLOCK_NODES(g->dim), *cut = w->sim->cut;
+    const uint32_t reach = (uint32_t)mpm_support(w->sim->def->basis) - 1;
     for (uint32_t block = stretch->first; block <= stretch->last; block++) {
         const uint32_t slot = g->slot[block];
-        if (slot > 0 && w->gathers) {
-            lines_ahead(g->fbar, slot, nodes * (size_t)g->fbar_stride, true);
-            lines_ahead(g->velocity, slot, nodes * (size_t)MPM_VELOCITY(g->dim), false);
-        } else if (slot > 0) {
-            lines_ahead(g->node, slot, nodes * MPM_NODE, true);
+        for (uint32_t k = 0; slot > 0 && k < 1u << g->dim; k++) {
+            const uint32_t first = g->near[slot][k], near = first / nodes;
+            const bool theirs = near > 0 && (near < cut[own] || near >= cut[own + 1]);
+            if ((k & 1 && block < stretch->last) || // the next one's own
+                (!theirs && (k > 0 || !(w->order->ties[t] & MPM_AWAITS)))) {
+                continue;
+            }
+            const size_t n = k >> (g->dim - 1) ? reach * nodes / MPM_EDGE : nodes; // reached
+            if (w->gathers) {
+                lines_ahead(g->fbar + (size_t)first * (size_t)g->fbar_stride,
+                            n * (size_t)g->fbar_stride, true);
+                lines_ahead(g->velocity + (size_t)first * (size_t)MPM_VELOCITY(g->dim),
+                            n * (size_t)MPM_VELOCITY(g->dim), false);
+            } else {
+                lines_ahead(g->node + (size_t)first * MPM_NODE, n * MPM_NODE, true);
+            }
         }
+    }
+}
+
+// Waits until those are done that come before a stretch of the part [begin, end), and are not
+// surely done by who comes to it. Adds the seconds that it takes to *since.
+static void await_before(const struct particles_work *w, uint32_t t, size_t begin, size_t end,
+                         double *since) {
+    const struct mpm_order *order = w->order;
+    const bool few = end - begin < FEW; // all by one thread, one after the other
+    if (few && !(order->ties[t] & MPM_AWAITS)) {
+        return;
+    }
+    for (uint32_t b = order->before_begin[t]; b < order->before_begin[t + 1]; b++) {
+        const uint32_t q = order->before[b];
+        if (few && q >= begin && q < end) {
+            continue;
+        }
+        atomic_uint *done = &order->done[order->flag[q]];
+        for (unsigned pass;
+             (pass = atomic_load_explicit(done, memory_order_acquire)) != w->number;) {
+            const double waits = now_or_zero(w->sim);
+            mpm_team_await(w->sim->team, done, pass);
+            *since += now_or_zero(w->sim) - waits;
+        }
+    }
+}
+
+// What nobody looks at is not said: each time, the flags' cache line has to come back from who has
+// looked last.
+static void say_done(const struct particles_work *w, uint32_t t, size_t begin, size_t end) {
+    if (end - begin >= FEW || (w->order->ties[t] & MPM_AWAITED)) {
+        atomic_uint *done = &w->order->done[w->order->flag[t]];
+        atomic_store_explicit(done, w->number, memory_order_release);
+        mpm_team_tell(w->sim->team, done);
     }
 }
 
 // Work that adds to the grid goes by stretches. One waits for those near it that come before it, so
 // that every node's sum has one order whatever the number of threads (order.h). Each thread does
-// its own part first, then what others are far from. Nobody waits for one that nobody will do:
-// those that other parts wait for come first and in their order (stretch.c), so that of all that
-// are being done there, the first waits for none that is, and a part's next is always done or taken
-// by the one whose part it is.
-static void work_on_stretches(void *context, int own, int there) {
-    const struct particles_work copy = *(const struct particles_work *)context, *w = &copy;
+// its own part first, then what others are far from. Nobody waits for one that nobody will do: the
+// parts' orders are those of one order of all stretches (stretch.c), so that of those that are not
+// done the first waits for none, and is always taken by the one whose part it is, if not before.
+static void work_on_stretches(const struct particles_work *w, int own, int there) {
     const struct mpm_order *order = w->order;
-    struct mpm_team *team = w->sim->team;
     struct mpm_span_result found = mpm_nothing_found();
     double since = there > 1 ? now_or_zero(w->sim) : 0;
     size_t work = 0;
@@ -327,26 +383,17 @@ static void work_on_stretches(void *context, int own, int there) {
         size_t at = begin;
         for (size_t i; next_of_part(turn, k == 0, begin, end, &at, &i);) {
             const uint32_t t = order->share[i], next = order->share[i + 1 < end ? i + 1 : i];
-            for (uint32_t q = order->before_begin[t]; there > 1 && q < order->before_begin[t + 1];
-                 q++) {
-                atomic_uint *done = &order->done[order->flag[order->before[q]]];
-                for (unsigned pass;
-                     (pass = atomic_load_explicit(done, memory_order_acquire)) != w->number;) {
-                    const double waits = now_or_zero(w->sim);
-                    mpm_team_await(team, done, pass);
-                    since += now_or_zero(w->sim) - waits;
+            const struct mpm_stretch *stretch = &order->stretch[t];
+            if (there > 1) {
+                await_before(w, t, begin, end, &since);
+                if (next != t && order->ties[next]) {
+                    nodes_ahead(w, next, own);
                 }
             }
-            if (there > 1 && next != t && order->when[next] == MPM_LAST) {
-                nodes_ahead(w, next);
-            }
-            work_on(w, order->stretch[t].begin, order->stretch[t].end, order->stretch[next].begin,
-                    &found, NULL);
-            work += order->stretch[t].end - order->stretch[t].begin;
+            work_on(w, stretch->begin, stretch->end, order->stretch[next].begin, &found, NULL);
+            work += stretch->end - stretch->begin;
             if (there > 1) {
-                atomic_uint *done = &order->done[order->flag[t]];
-                atomic_store_explicit(done, w->number, memory_order_release);
-                mpm_team_tell(team, done);
+                say_done(w, t, begin, end);
             }
         }
     }
@@ -360,12 +407,11 @@ static size_t chunk_begin(const struct mpm_order *order, size_t chunk) {
 
 // All other work goes by chunks, in the same parts. They do not take equal time, since what flows
 // costs more.
-static void work_on_chunks(void *context, int own, int there) {
-    const struct particles_work copy = *(const struct particles_work *)context, *w = &copy;
+static void work_on_chunks(const struct particles_work *w, int own, int there) {
     const struct mpm_order *order = w->order;
     const size_t n = w->span.s->n;
     if (w->clears_sums) {
-        clear_sums((void *)w->sim, own, there);
+        clear_sums(w->sim, own);
     }
     struct mpm_span_result found = mpm_nothing_found();
     double since = there > 1 ? now_or_zero(w->sim) : 0;
@@ -381,38 +427,40 @@ static void work_on_chunks(void *context, int own, int there) {
         for (size_t i; next_of_part(turn, k == 0, first, last, &at, &i);) {
             const size_t end = i + 1 < order->n_chunks ? chunk_begin(order, i + 1) : n;
             const size_t next = chunk_begin(order, i + 1 < last ? i + 1 : first);
-            work_on(w, chunk_begin(order, i), end, next, &found, w->sim->mass_dx[i]);
+            work_on(w, chunk_begin(order, i), end, next, &found, w->mass_dx[i]);
             work += end - chunk_begin(order, i);
         }
     }
     end_turn(w, own, &found, work, since);
 }
 
-// Work that adds to the grid, or that moves particles: then with m dx of these, in the order of the
-// chunks. What else was found stays with the threads until the step is over.
-static void for_particles(struct mpm_sim *sim, size_t body, struct particles_work w, bool adds,
-                          int *pass, double *mass_dx) {
-    const struct mpm_particles *s = w.span.s = &sim->sets[body];
-    w.span.grid = (struct mpm_grid *)&sim->grid;
+// A thread's share of work that adds to the grid, or that moves particles: then with m dx of these.
+// What is found stays with the threads until the step is over. One body comes after the other.
+static void for_particles(struct step_work *step, size_t body, struct particles_work w, bool adds,
+                          int own, int there) {
+    struct mpm_sim *sim = step->sim;
+    w.span = step->plan.span;
+    w.span.s = &sim->sets[body];
+    w.span.grid = &sim->grid;
+    w.span.fbar = step->plan.fbar && sim->sets[body].wants_fbar;
     w.sim = sim;
     w.order = &sim->orders[body];
+    if (body > 0) {
+        mpm_team_barrier(sim->team, own, there);
+    }
     if (w.order->n_stretches == 0) {
         return;
     }
     w.body = body;
-    w.pass = (*pass)++;
+    w.pass = step->pass++;
     w.parts = parts_of(sim, body);
-    w.n_parts = sim->team->n_there;
+    w.n_parts = there;
+    w.mass_dx = mass_dx_of(sim, body);
     if (adds) {
-        w.number = ++sim->pass;
-        mpm_team_run(sim->team, work_on_stretches, &w);
-        return;
-    }
-    mpm_team_run(sim->team, work_on_chunks, &w);
-    for (size_t k = 0; k < w.order->n_chunks; k++) {
-        for (int d = 0; d < s->dim; d++) {
-            mass_dx[d] += sim->mass_dx[k][d];
-        }
+        w.number = ++step->number;
+        work_on_stretches(&w, own, there);
+    } else {
+        work_on_chunks(&w, own, there);
     }
 }
 
@@ -499,11 +547,11 @@ static enum mpm_status check_result(const struct mpm_sim *sim, const struct mpm_
     return MPM_OK;
 }
 
-// Adds the time since *since to a phase.
-static void charge(struct mpm_sim *sim, enum mpm_phase phase, double *since) {
+// Adds the time since the end of the last one to a phase.
+static void charge(struct mpm_sim *sim, enum mpm_phase phase) {
     const double now = now_or_zero(sim);
-    sim->phase_seconds[phase] += now - *since;
-    *since = now;
+    sim->phase_seconds[phase] += now - sim->phase_begin;
+    sim->phase_begin = now;
 }
 
 static void advance_clock(struct mpm_sim *sim, double dt) {
@@ -596,19 +644,8 @@ static bool has_active_rigid(const struct mpm_sim *sim) {
     return any;
 }
 
-// eqs. 7, 8, 10, and the forces of loads and rigid bodies.
-static void particles_to_grid(struct mpm_sim *sim, double dt, bool any_fbar, int *pass,
-                              double *clock) {
-    share_out(sim);
-    if (!sim->sums_are_clear) {
-        mpm_team_run(sim->team, clear_sums, sim);
-    }
-    sim->sums_are_clear = false;
-    for (size_t b = 0; b < sim->n_sets; b++) {
-        const struct mpm_span span = {.dt = dt, .fbar = any_fbar && sim->sets[b].wants_fbar};
-        for_particles(sim, b, (struct particles_work){.span = span, .work = p2g}, true, pass, NULL);
-    }
-    charge(sim, MPM_PHASE_P2G, clock);
+// The forces of loads and rigid bodies.
+static void external_forces(struct mpm_sim *sim, double dt) {
     for (size_t k = 0; k < sim->n_loads; k++) {
         struct mpm_load *load = &sim->loads[k];
         struct mpm_particles *s = &sim->sets[load->def.body];
@@ -629,9 +666,6 @@ static void particles_to_grid(struct mpm_sim *sim, double dt, bool any_fbar, int
             mpm_contact_forces(rigid, sim->plain, &sim->sets[b], &sim->orders[b], &sim->grid, dt);
         }
     }
-    if (has_active_load(sim) || has_active_rigid(sim)) {
-        charge(sim, MPM_PHASE_CONTACT, clock);
-    }
 }
 
 static bool takes_part_in_fbar(const struct mpm_sim *sim) {
@@ -640,6 +674,97 @@ static bool takes_part_in_fbar(const struct mpm_sim *sim) {
         any |= sim->sets[b].wants_fbar;
     }
     return any && sim->c.now.fbar.scheme != MPM_FBAR_OFF;
+}
+
+// All have done a phase: who comes next needs what others have done in it.
+static void meet(const struct step_work *w, enum mpm_phase done, int own, int there) {
+    mpm_team_barrier(w->sim->team, own, there);
+    if (own == 0) {
+        charge(w->sim, done);
+    }
+}
+
+// One thread's share of a step's transfers, through which all go side by side.
+static void transfers(void *context, int own, int there) {
+    struct mpm_sim *sim = context;
+    const double *given = sim->team->given;
+    struct step_work work = {.sim = sim, .plan = sim->plan, .number = (unsigned)given[1]};
+    struct step_work *w = &work;
+    w->plan.span.dt = w->plan.motion.dt = given[0];
+    memcpy(w->plan.motion.gravity, given + 2, sizeof w->plan.motion.gravity);
+
+    // P2G, eqs. 7, 8, 10
+    if (w->plan.clears_sums) {
+        clear_sums(sim, own);
+        mpm_team_barrier(sim->team, own, there);
+    }
+    for (size_t b = 0; b < sim->n_sets; b++) {
+        for_particles(w, b, (struct particles_work){.work = p2g}, true, own, there);
+    }
+    meet(w, MPM_PHASE_P2G, own, there);
+    if (w->plan.forces) {
+        if (own == 0) {
+            external_forces(sim, w->plan.span.dt);
+        }
+        meet(w, MPM_PHASE_CONTACT, own, there);
+    }
+
+    // Grid, eq. 9, and boundary conditions
+    move_nodes(w, own, there);
+    meet(w, MPM_PHASE_GRID, own, there);
+
+    // G2P, eqs. 11-17; with F-bar, eq. 19 (Algorithm 1, step 3) with it
+    for (size_t b = 0; b < sim->n_sets; b++) {
+        const bool averaged = w->plan.fbar && sim->sets[b].wants_fbar;
+        const struct particles_work g = {
+            .work = g2p, .gathers = true, .clears_sums = !w->plan.fbar && b == 0};
+        for_particles(w, b, g, averaged, own, there);
+    }
+    if (!w->plan.fbar) {
+        return;
+    }
+    meet(w, MPM_PHASE_G2P, own, there);
+
+    // F-bar, eqs. 20-27: Algorithm 1, steps 4 and 5
+    divide_nodes(sim, own, there);
+    mpm_team_barrier(sim->team, own, there);
+    for (size_t b = 0; b < sim->n_sets; b++) {
+        if (sim->sets[b].wants_fbar) {
+            for_particles(w, b, (struct particles_work){.work = fbar}, false, own, there);
+        }
+    }
+}
+
+// What of a step is as it was in the last one is not written again: so it stays where all threads
+// have it at hand, and what changes lies in the line that tells them that there is work.
+static void run_transfers(struct mpm_sim *sim, double dt, const double *gravity) {
+    const struct mpm_settings *now = &sim->c.now;
+    struct mpm_plan plan;
+    memset(&plan, 0, sizeof plan); // its padding, too
+    plan.fbar = takes_part_in_fbar(sim);
+    plan.forces = sim->body_forces || has_active_load(sim) || has_active_rigid(sim);
+    plan.clears_sums = !sim->sums_are_clear;
+    plan.span.blend = now->blend;
+    plan.span.scheme = now->fbar.scheme;
+    plan.span.a = now->fbar.a;
+    plan.span.C = now->fbar.C;
+    plan.span.keep = now->fbar.keep;
+    plan.motion.local = now->damping_local;
+    plan.motion.mass = now->damping_mass;
+    if (memcmp(&plan, &sim->plan, sizeof plan) != 0) {
+        memcpy(&sim->plan, &plan, sizeof plan);
+    }
+    double *given = sim->team->given;
+    given[0] = dt;
+    given[1] = sim->pass;
+    memcpy(given + 2, gravity, MPM_MAX_DIM * sizeof *gravity);
+    mpm_team_run(sim->team, transfers, sim);
+    for (size_t b = 0; b < sim->n_sets; b++) {
+        const bool there_are = sim->orders[b].n_stretches > 0;
+        sim->pass += there_are ? 1 + (plan.fbar && sim->sets[b].wants_fbar) : 0;
+    }
+    sim->sums_are_clear = true;
+    charge(sim, plan.fbar ? MPM_PHASE_FBAR : MPM_PHASE_G2P);
 }
 
 static enum mpm_status step(struct mpm_sim *sim, struct mpm_error *err) {
@@ -652,70 +777,22 @@ static enum mpm_status step(struct mpm_sim *sim, struct mpm_error *err) {
     }
     double gravity[MPM_MAX_DIM] = {0};
     mpm_gravity_at(sim, sim->c.time, gravity);
-    double clock = now_or_zero(sim);
+    sim->phase_begin = now_or_zero(sim);
     if (sort_is_due(sim)) {
         if (!mpm_sort(sim)) {
             return step_failure(sim, MPM_ERR_MEMORY, time, -1, "bytes of particles and grid",
                                 (double)mpm_bytes(sim), err);
         }
-        charge(sim, MPM_PHASE_SORT, &clock);
+        charge(sim, MPM_PHASE_SORT);
     }
 
-    // P2G, eqs. 7, 8, 10
-    const enum mpm_fbar_scheme scheme = now->fbar.scheme;
-    const bool any_fbar = takes_part_in_fbar(sim);
-    if (sim->grid.fbar_stride != mpm_fbar_scalars(scheme)) {
-        sim->grid.fbar_stride = mpm_fbar_scalars(scheme);
+    if (sim->grid.fbar_stride != mpm_fbar_scalars(now->fbar.scheme)) {
+        sim->grid.fbar_stride = mpm_fbar_scalars(now->fbar.scheme);
     }
-    int pass = 0;
-    particles_to_grid(sim, dt, any_fbar, &pass, &clock);
-
-    // Grid, eq. 9, and boundary conditions
-    struct nodes_work motion = {.sim = sim,
-                                .fbar = any_fbar,
-                                .motion = {.dt = dt,
-                                           .local = now->damping_local,
-                                           .mass = now->damping_mass,
-                                           .gravity = {gravity[0], gravity[1], gravity[2]}}};
-    mpm_team_run(sim->team, move_nodes, &motion);
-    charge(sim, MPM_PHASE_GRID, &clock);
-
-    // G2P, eqs. 11-17; with F-bar, eq. 19 (Algorithm 1, step 3) with it
+    share_out(sim);
+    run_transfers(sim, dt, gravity);
     struct mpm_span_result found = mpm_nothing_found();
-    double mass_dx[MPM_MAX_DIM] = {0};
-    for (size_t b = 0; b < sim->n_sets; b++) {
-        const bool averaged = any_fbar && sim->sets[b].wants_fbar;
-        const struct mpm_span span = {.dt = dt,
-                                      .blend = now->blend,
-                                      .fbar = averaged,
-                                      .scheme = scheme,
-                                      .a = now->fbar.a,
-                                      .C = now->fbar.C,
-                                      .keep = now->fbar.keep};
-        const struct particles_work work = {
-            .span = span, .work = g2p, .gathers = true, .clears_sums = !any_fbar && b == 0};
-        for_particles(sim, b, work, averaged, &pass, mass_dx);
-    }
-    charge(sim, MPM_PHASE_G2P, &clock);
-
-    // F-bar, eqs. 20-27: Algorithm 1, steps 4 and 5
-    if (any_fbar) {
-        mpm_team_run(sim->team, divide_nodes, sim);
-        for (size_t b = 0; b < sim->n_sets; b++) {
-            if (sim->sets[b].wants_fbar) {
-                const struct mpm_span span = {
-                    .fbar = true, .scheme = scheme, .C = now->fbar.C, .keep = now->fbar.keep};
-                for_particles(sim, b, (struct particles_work){.span = span, .work = fbar}, false,
-                              &pass, mass_dx);
-            }
-        }
-        charge(sim, MPM_PHASE_FBAR, &clock);
-    }
-    sim->sums_are_clear = true;
-    if (pass > 0) {
-        join_found(sim, &found);
-    }
-    memcpy(found.mass_dx, mass_dx, sizeof mass_dx);
+    join_found(sim, &found);
     sim->c.runs = found.n_runs;
     sim->c.runs_at_sort = sim->c.steps_since_sort == 0 ? found.n_runs : sim->c.runs_at_sort;
 
@@ -723,7 +800,7 @@ static enum mpm_status step(struct mpm_sim *sim, struct mpm_error *err) {
     if (!status && has_active_rigid(sim)) {
         move_rigid_bodies(sim, dt, &found);
         status = check_result(sim, &found, time, err); // none was pushed out of the domain
-        charge(sim, MPM_PHASE_CONTACT, &clock);
+        charge(sim, MPM_PHASE_CONTACT);
     }
     if (status) {
         return status;

@@ -11,7 +11,8 @@
 #define LONGEST 512              // in a body of many
 // For sharing work out: what these cost besides, as particles.
 #define STRETCH_WORK 12
-#define CUT_WORK 256 // a cut within a row, where each of the parts then waits for the other
+#define CUT_WORK 32  // a cut within a row, along which more nodes are common to the parts
+#define HOP_WORK 128 // until what one thread has done is where another needs it
 
 void mpm_order_free(struct mpm_order *order) {
     free(order->tile);
@@ -24,7 +25,9 @@ void mpm_order_free(struct mpm_order *order) {
     free(order->done);
     free(order->share);
     free(order->flag);
-    free(order->when);
+    free(order->ties);
+    free(order->ended);
+    free(order->parts);
     *order = (struct mpm_order){0};
 }
 
@@ -58,7 +61,8 @@ static bool reserve_stretches(struct mpm_order *order, size_t n) {
         !resize(&order->work_before, (room + 1) * sizeof *order->work_before) ||
         !resize(&order->chunk, (room + 1) * sizeof *order->chunk) ||
         !resize(&order->share, room * sizeof *order->share) ||
-        !resize(&order->flag, room * sizeof *order->flag) || !resize(&order->when, room)) {
+        !resize(&order->flag, room * sizeof *order->flag) || !resize(&order->ties, room) ||
+        !resize(&order->ended, room * sizeof *order->ended)) {
         return false;
     }
     order->capacity = room;
@@ -226,6 +230,12 @@ bool mpm_order_stretches(struct mpm_order *order, const struct mpm_grid *grid, e
         }
         order->n_flags = n_flags;
     }
+    if (n_threads > order->most_parts) {
+        if (!resize(&order->parts, (size_t)n_threads * sizeof *order->parts)) {
+            return false;
+        }
+        order->most_parts = n_threads;
+    }
     if (order->n_stretches == 0) {
         return true;
     }
@@ -274,108 +284,182 @@ size_t mpm_order_cut(const struct mpm_order *order, double share) {
     return best;
 }
 
-// Marks what t waits for MPM_FIRST if it is, or t MPM_LAST if what it waits for is.
-static void spread(struct mpm_order *order, size_t t, size_t begin, size_t end, bool first) {
+static bool is_of(const struct mpm_part *part, uint32_t t) {
+    return t >= part->begin && t < part->end;
+}
+
+// What of other parts waits for t, or t for it, by itself or through others of t's part.
+static void find_ties(struct mpm_order *order, const struct mpm_part *parts, int n) {
+    memset(order->ties, 0, order->n_stretches);
+    for (int colour = order->n_colours; colour-- > 0;) { // from what comes last
+        for (int k = n; k-- > 0;) {
+            for (size_t t = parts[k].end; t-- > parts[k].begin;) {
+                for (uint32_t b = order->before_begin[t];
+                     order->colour[t] == colour && b < order->before_begin[t + 1]; b++) {
+                    const uint32_t q = order->before[b];
+                    if (!is_of(&parts[k], q) || (order->ties[t] & MPM_AWAITED)) {
+                        order->ties[q] |= MPM_AWAITED;
+                    }
+                }
+            }
+        }
+    }
+    for (int colour = 0; colour < order->n_colours; colour++) {
+        for (int k = 0; k < n; k++) {
+            for (size_t t = parts[k].begin; t < parts[k].end; t++) {
+                for (uint32_t b = order->before_begin[t];
+                     order->colour[t] == colour && b < order->before_begin[t + 1]; b++) {
+                    const uint32_t q = order->before[b];
+                    if (!is_of(&parts[k], q) || (order->ties[q] & MPM_AWAITS)) {
+                        order->ties[t] |= MPM_AWAITS;
+                    }
+                }
+            }
+        }
+    }
+}
+
+// The tied ones of a part by colour: first those that others wait for.
+static void list_tied(struct mpm_order *order, struct mpm_part *part) {
+    for (size_t t = part->begin; t < part->end; t++) {
+        part->n_tied += order->ties[t] != 0;
+    }
+    size_t at = part->end - part->n_tied;
+    for (int awaited = MPM_AWAITED; awaited >= 0; awaited -= MPM_AWAITED) {
+        for (int colour = 0; colour < order->n_colours; colour++) {
+            for (size_t t = part->begin; t < part->end; t++) {
+                if (order->colour[t] == colour && order->ties[t] &&
+                    (order->ties[t] & MPM_AWAITED) == awaited) {
+                    order->share[at++] = (uint32_t)t;
+                }
+            }
+        }
+    }
+}
+
+#define NEVER UINT64_MAX
+
+// When all that t waits for is done, and known to be where t is done.
+static uint64_t ready_at(const struct mpm_order *order, const struct mpm_part *part, uint32_t t) {
+    uint64_t ready = 0;
     for (uint32_t b = order->before_begin[t]; b < order->before_begin[t + 1]; b++) {
         const uint32_t q = order->before[b];
-        if (first && order->when[t] == MPM_FIRST && q >= begin && q < end) {
-            order->when[q] = MPM_FIRST;
-        } else if (!first && order->when[q] == MPM_LAST && order->when[t] != MPM_FIRST) {
-            order->when[t] = MPM_LAST;
+        if (order->ended[q] == NEVER) {
+            return NEVER;
         }
+        const uint64_t at = order->ended[q] + (is_of(part, q) ? 0 : HOP_WORK);
+        ready = at > ready ? at : ready;
     }
+    return ready;
 }
 
-static void find_first_and_last(struct mpm_order *order, const uint32_t *parts, int n) {
-    memset(order->when, MPM_BETWEEN, order->n_stretches);
-    for (int k = 0; k < n; k++) {
-        const size_t begin = order->chunk[parts[k]], end = order->chunk[parts[k + 1]];
-        for (size_t t = begin; t < end; t++) {
-            for (uint32_t b = order->before_begin[t]; b < order->before_begin[t + 1]; b++) {
-                const uint32_t q = order->before[b];
-                if (q < begin || q >= end) {
-                    order->when[q] = MPM_FIRST;
-                    order->when[t] = order->when[t] == MPM_FIRST ? MPM_FIRST : MPM_LAST;
-                }
-            }
-        }
-    }
-    for (int k = 0; k < n; k++) {
-        const size_t begin = order->chunk[parts[k]], end = order->chunk[parts[k + 1]];
-        for (int colour = order->n_colours; colour-- > 0;) { // from what comes last
-            for (size_t t = end; t-- > begin;) {
-                if (order->colour[t] == colour) {
-                    spread(order, t, begin, end, true);
-                }
-            }
-        }
-        for (int colour = 0; colour < order->n_colours; colour++) {
-            for (size_t t = begin; t < end; t++) {
-                if (order->colour[t] == colour) {
-                    spread(order, t, begin, end, false);
-                }
-            }
-        }
-    }
+static void place(struct mpm_order *order, struct mpm_part *part, uint32_t t) {
+    part->clock = part->looks + order->stretch[t].end - order->stretch[t].begin + STRETCH_WORK;
+    part->looks = part->clock;
+    order->ended[t] = part->clock;
+    order->share[part->begin + part->n_placed++] = t;
 }
 
-// The stretches of a part that are done at a time, by colour; shared out from `at` on. Returns
-// where they end.
-static size_t share_by_colour(struct mpm_order *order, size_t begin, size_t end, enum mpm_when when,
-                              size_t at) {
-    for (int colour = 0; colour < order->n_colours; colour++) {
-        for (size_t t = begin; t < end; t++) {
-            if (order->colour[t] == colour && order->when[t] == when) {
-                order->share[at++] = (uint32_t)t;
-            }
-        }
-    }
-    return at;
+static void place_tied(struct mpm_order *order, struct mpm_part *part, size_t i) {
+    uint32_t *tied = order->share + part->end - part->n_tied;
+    const uint32_t t = tied[i];
+    memmove(tied + 1, tied, i * sizeof *tied);
+    part->n_tied--;
+    place(order, part, t);
 }
 
-// What a stretch waits for that is not yet placed, or itself.
+// What t waits for that is not yet placed, or itself.
 static uint32_t first_of(const struct mpm_order *order, uint32_t t) {
     for (uint32_t b = order->before_begin[t]; b < order->before_begin[t + 1]; b++) {
-        if (order->when[order->before[b]] == MPM_BETWEEN) {
+        if (order->ended[order->before[b]] == NEVER) {
             return order->before[b];
         }
     }
     return t;
 }
 
-// A stretch, after those that it waits for and these after theirs. Those on the way to the one that
-// comes first are kept at the other end of what is not yet shared out.
-static size_t share_in_place(struct mpm_order *order, uint32_t t, size_t at, size_t end) {
-    size_t top = end;
-    order->share[--top] = t;
-    while (top < end) {
-        const uint32_t now = order->share[top], next = first_of(order, now);
-        if (next != now) {
-            order->share[--top] = next;
-        } else {
-            order->when[now] = MPM_PLACED;
-            top++;
-            order->share[at++] = now;
+// The next untied stretch near the order of memory, after those that it waits for.
+static bool place_untied(struct mpm_order *order, struct mpm_part *part) {
+    for (size_t i = part->untied; i < part->end; i++) {
+        if (order->ties[i] || order->ended[i] != NEVER) {
+            part->untied += i == part->untied;
+            continue;
+        }
+        uint32_t t = (uint32_t)i, first;
+        while ((first = first_of(order, t)) != t) {
+            t = first;
+        }
+        if (!order->ties[t]) {
+            place(order, part, t);
+            return true;
         }
     }
-    return at;
+    return false;
 }
 
-void mpm_order_share(struct mpm_order *order, const uint32_t *parts, int n) {
-    if (order->n_stretches == 0) {
-        return;
+// What a part's thread takes up next: what others wait for, if it can; else what is not tied to
+// others; else what waits for them. If it can none of these, it looks again when it can. It begins
+// with one that is not tied, while the nodes of the next are on their way.
+static bool place_next(struct mpm_order *order, struct mpm_part *part) {
+    const uint32_t *tied = order->share + part->end - part->n_tied;
+    size_t next = part->n_tied;
+    uint64_t soonest = NEVER;
+    if (part->n_placed == 0 && place_untied(order, part)) {
+        return true;
     }
-    find_first_and_last(order, parts, n);
+    for (size_t i = 0; i < part->n_tied; i++) {
+        const uint64_t ready = ready_at(order, part, tied[i]);
+        if (ready <= part->looks && (order->ties[tied[i]] & MPM_AWAITED)) {
+            place_tied(order, part, i);
+            return true;
+        }
+        next = ready <= part->looks && next == part->n_tied ? i : next;
+        soonest = ready < soonest ? ready : soonest;
+    }
+    if (place_untied(order, part)) {
+        return true;
+    }
+    if (next < part->n_tied) {
+        place_tied(order, part, next);
+        return true;
+    }
+    part->looks = soonest;
+    return false;
+}
+
+// All parts are gone through side by side, as their threads will: so that of all stretches that are
+// not done, the one that comes first here waits for none, and is the next of its part.
+void mpm_order_share(struct mpm_order *order, const uint32_t *cuts, int n) {
+    struct mpm_part *parts = order->parts;
     for (int k = 0; k < n; k++) {
-        const size_t begin = order->chunk[parts[k]], end = order->chunk[parts[k + 1]];
-        size_t at = share_by_colour(order, begin, end, MPM_FIRST, begin);
-        for (size_t t = begin; t < end; t++) {
-            if (order->when[t] == MPM_BETWEEN) {
-                at = share_in_place(order, (uint32_t)t, at, end);
+        const size_t begin = order->chunk[cuts[k]];
+        parts[k] =
+            (struct mpm_part){.begin = begin, .end = order->chunk[cuts[k + 1]], .untied = begin};
+    }
+    find_ties(order, parts, n);
+    for (int k = 0; k < n; k++) {
+        list_tied(order, &parts[k]);
+    }
+    for (size_t t = 0; t < order->n_stretches; t++) {
+        order->ended[t] = NEVER;
+    }
+    for (size_t placed = 0; placed < order->n_stretches;) {
+        struct mpm_part *part = NULL; // that looks first
+        for (int k = 0; k < n; k++) {
+            if (parts[k].begin + parts[k].n_placed < parts[k].end &&
+                (!part || parts[k].looks < part->looks)) {
+                part = &parts[k];
             }
         }
-        share_by_colour(order, begin, end, MPM_LAST, at);
-        for (size_t i = begin; i < end; i++) {
+        if (place_next(order, part)) {
+            placed++;
+            for (int k = 0; k < n; k++) {
+                parts[k].looks = parts[k].clock; // it may be able to go on
+            }
+        }
+    }
+    for (int k = 0; k < n; k++) {
+        for (size_t i = parts[k].begin; i < parts[k].end; i++) {
             order->flag[order->share[i]] = (uint32_t)(i + (size_t)k * MPM_APART);
             atomic_init(&order->done[i + (size_t)k * MPM_APART], 0);
         }

@@ -100,25 +100,42 @@ void mpm_team_free(struct mpm_team *team) {
     }
 }
 
-void mpm_team_barrier(struct mpm_team *team, int there) {
+// Says that a thread has come to a barrier, and returns which it is.
+static unsigned come(struct mpm_team *team, int own) {
+    atomic_uint *met = &team->seats[own].met;
+    const unsigned barrier = atomic_load_explicit(met, memory_order_relaxed) + 1;
+    atomic_store_explicit(met, barrier, memory_order_release);
+    mpm_team_tell(team, met);
+    return barrier;
+}
+
+// Waits until a thread has come to a barrier; it may be past it.
+static void await_at(struct mpm_team *team, int other, unsigned barrier) {
+    atomic_uint *met = &team->seats[other].met;
+    for (unsigned now;
+         (int)((now = atomic_load_explicit(met, memory_order_acquire)) - barrier) < 0;) {
+        mpm_team_await(team, met, now);
+    }
+}
+
+// Each looks at all others: so it takes one way between two cores, not the way to a common word and
+// back.
+void mpm_team_barrier(struct mpm_team *team, int own, int there) {
     if (there == 1) {
         return;
     }
-    const unsigned meeting = atomic_load_explicit(&team->meeting, memory_order_relaxed);
-    if (atomic_fetch_add(&team->met, 1) + 1 < (unsigned)there) {
-        mpm_team_await(team, &team->meeting, meeting);
-        return;
+    const unsigned barrier = come(team, own);
+    for (int k = 0; k < there; k++) {
+        if (k != own) {
+            await_at(team, k, barrier);
+        }
     }
-    atomic_store_explicit(&team->met, 0, memory_order_relaxed);
-    atomic_store_explicit(&team->meeting, meeting + 1, memory_order_release);
-    mpm_team_tell(team, &team->meeting);
 }
 
-static unsigned next_round(struct mpm_team *team) {
+static void next_round(struct mpm_team *team) {
     const unsigned round = atomic_load_explicit(&team->round, memory_order_relaxed) + 1;
     atomic_store_explicit(&team->round, round, memory_order_release);
     mpm_team_tell(team, &team->round);
-    return round;
 }
 
 static void serve(struct mpm_team *team, unsigned round, int own, int there) {
@@ -128,9 +145,7 @@ static void serve(struct mpm_team *team, unsigned round, int own, int there) {
             return;
         }
         team->work(team->context, own, there);
-        atomic_uint *done = &team->seats[own].done;
-        atomic_store_explicit(done, round, memory_order_release);
-        mpm_team_tell(team, done);
+        come(team, own);
     }
 }
 
@@ -139,7 +154,7 @@ void mpm_team_hold(struct mpm_team *team, void (*body)(void *context), void *con
     if (team->n_threads > 1 && !team->held) {
         const unsigned round = atomic_load(&team->round);
         for (int k = 0; k < team->n_threads; k++) {
-            atomic_init(&team->seats[k].done, round);
+            atomic_init(&team->seats[k].met, 0);
         }
         team->over = false;
 #pragma omp parallel num_threads(team->n_threads)
@@ -168,15 +183,19 @@ void mpm_team_run(struct mpm_team *team, mpm_team_work *work, void *context) {
     if (there > 1) {
         team->work = work;
         team->context = context;
-        const unsigned round = next_round(team);
+        next_round(team);
         work(context, 0, there);
+        const unsigned end = come(team, 0);
         for (int k = 1; k < there; k++) {
-            mpm_team_await(team, &team->seats[k].done, round - 1);
+            await_at(team, k, end);
         }
         return;
     }
 #ifdef _OPENMP
     if (team->n_threads > 1 && !team->held) {
+        for (int k = 0; k < team->n_threads; k++) {
+            atomic_init(&team->seats[k].met, 0);
+        }
 #pragma omp parallel num_threads(team->n_threads)
         work(context, omp_get_thread_num(), omp_get_num_threads());
         return;

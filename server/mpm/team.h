@@ -14,9 +14,10 @@ typedef void mpm_team_work(void *context, int own, int there);
 // What one thread says to the others has a cache line of its own, and all that is said at once lies
 // in one: to fetch a line that another core has changed takes longer than all else of a meeting.
 struct mpm_seat {
-    _Alignas(64) atomic_uint done; // the last round whose part is done
+    _Alignas(64) atomic_uint met; // barriers and ends of rounds that the thread has come to
 };
 
+#define MPM_GIVEN 5
 struct mpm_team {
     int n_threads; // wanted; OpenMP may give fewer
     int n_there;   // that stand by; 1 outside mpm_team_hold
@@ -27,10 +28,19 @@ struct mpm_team {
     bool over;
     mpm_team_work *work;
     void *context;
-    _Alignas(64) atomic_uint met;     // at the barrier
-    _Alignas(64) atomic_uint meeting; // barriers that all have come to
-    _Alignas(64) atomic_uint asleep;  // threads that wait in the kernel
+    double given[MPM_GIVEN]; // for the work: what changes from one to the next, in the same line
+    _Alignas(64) atomic_uint asleep; // threads that wait in the kernel
 };
+
+// Has a cache line on its way, to be changed here: a common prefetch brings a copy, which to change
+// takes another way to the core that has it.
+static inline void mpm_prefetch_to_write(const void *line) {
+#if defined __x86_64__
+    __asm__ volatile("prefetchw %0" : : "m"(*(const char *)line)); // does nothing where unknown
+#else
+    __builtin_prefetch(line, 1);
+#endif
+}
 
 // NULL when memory is short.
 struct mpm_team *mpm_team_create(int n_threads);
@@ -41,7 +51,7 @@ void mpm_team_hold(struct mpm_team *team, void (*body)(void *context), void *con
 // Memory that was written before is seen by all parts, and what they write by who called.
 void mpm_team_run(struct mpm_team *team, mpm_team_work *work, void *context);
 // Within such work: waits until all `there` have come here.
-void mpm_team_barrier(struct mpm_team *team, int there);
+void mpm_team_barrier(struct mpm_team *team, int own, int there);
 // Within such work: waits until the word is not `old`. Who changes it stores with release order,
 // and then tells the team.
 void mpm_team_await(struct mpm_team *team, atomic_uint *word, unsigned old);

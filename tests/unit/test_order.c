@@ -1,4 +1,5 @@
 // Stretches of random bodies: whole, in one order that any number of threads can keep, and apart.
+#include <math.h>
 #include <setjmp.h>
 #include <stdarg.h>
 #include <stddef.h>
@@ -157,9 +158,84 @@ static void test_order_stretches_of_random_bodies(void **state) {
     }
 }
 
+// The time, in particles, in which threads that are as fast as each other get through their parts,
+// when each hears of what another has done `late`; and the longest part's.
+static double time_of_parts(const struct mpm_order *order, const uint32_t *cuts, int n, double late,
+                            double *longest) {
+    uint32_t next[8];
+    double clock[8] = {0}, all = 0;
+    double *ended = calloc(order->n_stretches, sizeof *ended);
+    assert_non_null(ended);
+    *longest = 0;
+    for (int k = 0; k < n; k++) {
+        next[k] = order->chunk[cuts[k]];
+    }
+    for (size_t left = order->n_stretches; left > 0;) {
+        for (int k = 0; k < n; k++) {
+            const uint32_t begin = order->chunk[cuts[k]], end = order->chunk[cuts[k + 1]];
+            bool ready = next[k] < end;
+            while (ready) {
+                const uint32_t t = order->share[next[k]];
+                double at = clock[k];
+                for (uint32_t b = order->before_begin[t]; b < order->before_begin[t + 1]; b++) {
+                    const uint32_t q = order->before[b];
+                    ready &= ended[q] > 0;
+                    at = fmax(at, q >= begin && q < end ? 0 : ended[q] + late);
+                }
+                if (ready) {
+                    ended[t] = clock[k] = at + order->stretch[t].end - order->stretch[t].begin;
+                    left--;
+                    ready = ++next[k] < end;
+                }
+            }
+        }
+    }
+    for (int k = 0; k < n; k++) {
+        double work = 0;
+        for (uint32_t t = order->chunk[cuts[k]]; t < order->chunk[cuts[k + 1]]; t++) {
+            work += order->stretch[t].end - order->stretch[t].begin;
+        }
+        all = fmax(all, clock[k]);
+        *longest = fmax(*longest, work);
+    }
+    free(ended);
+    return all;
+}
+
+// A pool that two threads share: wherever the cut is, within a row of blocks too, neither waits for
+// the other, though news take as long as a stretch's work.
+static void test_order_of_two_parts_without_waiting(void **state) {
+    (void)state;
+    for (int dim = 2; dim <= 3; dim++) {
+        struct mpm_order order = {0};
+        struct mpm_grid grid = {.dim = dim, .n_blocks = {8, dim == 2 ? 6 : 3, dim == 2 ? 1 : 6}};
+        const uint32_t n_blocks =
+            (uint32_t)(grid.n_blocks[0] * grid.n_blocks[1] * grid.n_blocks[2]);
+        const uint32_t per_block = dim == 2 ? 64 : 128;
+        for (uint32_t block = 0; block < n_blocks; block++) {
+            assert_true(mpm_order_reserve(&order, block + 1));
+            order.tile[order.n_tiles++] = (struct mpm_tile){
+                .begin = block * per_block, .end = (block + 1) * per_block, .block = block};
+        }
+        assert_true(mpm_order_stretches(&order, &grid, MPM_BSPLINE2, 2));
+        for (uint32_t cut = (uint32_t)order.n_chunks / 3; cut <= 2 * order.n_chunks / 3; cut++) {
+            const uint32_t cuts[] = {0, cut, (uint32_t)order.n_chunks};
+            double longest;
+            mpm_order_share(&order, cuts, 2);
+            const double time = time_of_parts(&order, cuts, 2, 128, &longest);
+            if (time > longest) {
+                fail_msg("%dD, cut at chunk %u of %zu: %g, where the longer part is %g", dim, cut,
+                         order.n_chunks, time, longest);
+            }
+        }
+        mpm_order_free(&order);
+    }
+}
+
 int main(void) {
     const struct CMUnitTest tests[] = {
         cmocka_unit_test(test_order_stretches_of_random_bodies),
+        cmocka_unit_test(test_order_of_two_parts_without_waiting),
     };
     return cmocka_run_group_tests(tests, NULL, NULL);
 }

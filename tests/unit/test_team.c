@@ -29,13 +29,13 @@ static void take_part(void *context, int own, int there) {
     if (own == 0) {
         c->there = there;
     }
-    mpm_team_barrier(c->team, there);
+    mpm_team_barrier(c->team, own, there);
     if (own == there - 1) { // what all wrote before the barrier is there after it
         for (int k = 0; k < there; k++) {
             c->sum += c->read[k];
         }
     }
-    mpm_team_barrier(c->team, there);
+    mpm_team_barrier(c->team, own, there);
     c->read[own] = 0;
 }
 
