@@ -11,6 +11,10 @@
 #define UNSTABLE_CFL                                                                               \
     1.0 // no basis is stable at dt >= 0.9 h/c (docs/method.md): beyond this it is not tried
 
+// What is told anew in every step (team->given); the third to fifth are gravity.
+enum given { GIVEN_DT, GIVEN_PASS, GIVEN_GRAVITY };
+_Static_assert(GIVEN_GRAVITY + MPM_MAX_DIM <= MPM_GIVEN, "room for gravity");
+
 // What a thread knows of a step.
 struct step_work {
     struct mpm_sim *sim;
@@ -688,10 +692,10 @@ static void meet(const struct step_work *w, enum mpm_phase done, int own, int th
 static void transfers(void *context, int own, int there) {
     struct mpm_sim *sim = context;
     const double *given = sim->team->given;
-    struct step_work work = {.sim = sim, .plan = sim->plan, .number = (unsigned)given[1]};
+    struct step_work work = {.sim = sim, .plan = sim->plan, .number = (unsigned)given[GIVEN_PASS]};
     struct step_work *w = &work;
-    w->plan.span.dt = w->plan.motion.dt = given[0];
-    memcpy(w->plan.motion.gravity, given + 2, sizeof w->plan.motion.gravity);
+    w->plan.span.dt = w->plan.motion.dt = given[GIVEN_DT];
+    memcpy(w->plan.motion.gravity, given + GIVEN_GRAVITY, sizeof w->plan.motion.gravity);
 
     // P2G, eqs. 7, 8, 10
     if (w->plan.clears_sums) {
@@ -755,9 +759,9 @@ static void run_transfers(struct mpm_sim *sim, double dt, const double *gravity)
         memcpy(&sim->plan, &plan, sizeof plan);
     }
     double *given = sim->team->given;
-    given[0] = dt;
-    given[1] = sim->pass;
-    memcpy(given + 2, gravity, MPM_MAX_DIM * sizeof *gravity);
+    given[GIVEN_DT] = dt;
+    given[GIVEN_PASS] = sim->pass;
+    memcpy(given + GIVEN_GRAVITY, gravity, MPM_MAX_DIM * sizeof *gravity);
     mpm_team_run(sim->team, transfers, sim);
     for (size_t b = 0; b < sim->n_sets; b++) {
         const bool there_are = sim->orders[b].n_stretches > 0;
