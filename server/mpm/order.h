@@ -66,7 +66,8 @@ struct mpm_order {
     // Never depends on the number of threads: sums go by chunks.
     uint32_t *chunk; // (n_chunks + 1) first stretch of each, and n_stretches
     size_t n_chunks;
-    atomic_uint *done; // (n_stretches + parts * MPM_APART) the pass that has last done one
+    atomic_uint *done; // (n_stretches + parts * MPM_APART) the pass that has last done one: of
+                       // those that another thread may look at, the others' say nothing
     size_t n_flags;    // room in `done`
     // The stretches in parts of chunks, each in an order that keeps what they wait for and is near
     // that of memory.
@@ -104,9 +105,9 @@ bool mpm_order_stretches(struct mpm_order *order, const struct mpm_grid *grid, e
 // The chunk before which there is about a share (0 to 1) of the body's work; where a row begins, if
 // one does near there.
 size_t mpm_order_cut(const struct mpm_order *order, double share);
-// Shares the stretches out in n parts, of which part k begins with chunk parts[k], and n ends the
-// last.
-void mpm_order_share(struct mpm_order *order, const uint32_t *parts, int n);
+// Shares the stretches out in n parts, of which part k begins with chunk cuts[k], and cuts[n] ends
+// the last.
+void mpm_order_share(struct mpm_order *order, const uint32_t *cuts, int n);
 // Gives every block that particles of the tiles can reach before the next sort its slot. False when
 // memory is short.
 bool mpm_order_activate(const struct mpm_order *order, struct mpm_grid *grid, enum mpm_basis basis);

@@ -431,6 +431,9 @@ static bool place_next(struct mpm_order *order, struct mpm_part *part) {
 // not done, the one that comes first here waits for none, and is the next of its part.
 void mpm_order_share(struct mpm_order *order, const uint32_t *cuts, int n) {
     struct mpm_part *parts = order->parts;
+    if (order->n_stretches == 0) {
+        return;
+    }
     for (int k = 0; k < n; k++) {
         const size_t begin = order->chunk[cuts[k]];
         parts[k] =

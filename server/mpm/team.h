@@ -1,6 +1,6 @@
 // The threads of one simulation, which stand by for a whole step.
 //
-// A step is some short pieces of parallel work. To open an OpenMP region for each, and to meet at
+// A step is parallel work with some meetings. To open an OpenMP region for it, and to meet at
 // its barriers, takes some microseconds a piece, as long as a small scene's work itself; threads
 // that stand by for the step take a fraction of that. OpenMP makes the threads and lends them for
 // the step.
@@ -28,7 +28,8 @@ struct mpm_team {
     bool over;
     mpm_team_work *work;
     void *context;
-    double given[MPM_GIVEN]; // for the work: what changes from one to the next, in the same line
+    double given[MPM_GIVEN]; // (what fills the line) for the work: what changes from one to the
+                             // next, in the same line
     _Alignas(64) atomic_uint asleep; // threads that wait in the kernel
 };
 

@@ -107,6 +107,20 @@ static void check_shares(struct mpm_order *order, int n_parts) {
                             order->chunk[parts[k + 1]] - 1);
         }
     }
+    // Who waits for a stretch of another part knows that it has to look, and whose it is that it
+    // has to be told (step.c: await_before, say_done).
+    for (size_t t = 0; t < order->n_stretches; t++) {
+        for (uint32_t b = order->before_begin[t]; b < order->before_begin[t + 1]; b++) {
+            const uint32_t q = order->before[b];
+            bool together = false;
+            for (int k = 0; k < n_parts; k++) {
+                const uint32_t begin = order->chunk[parts[k]], end = order->chunk[parts[k + 1]];
+                together |= t >= begin && t < end && q >= begin && q < end;
+            }
+            assert_true(together || ((order->ties[q] & MPM_AWAITED) != 0 &&
+                                     (order->ties[t] & MPM_AWAITS) != 0));
+        }
+    }
     size_t left = order->n_stretches;
     for (size_t idle = 0; left > 0; idle++) {
         assert_true(idle < 1000); // nobody could go on
@@ -170,7 +184,9 @@ static double time_of_parts(const struct mpm_order *order, const uint32_t *cuts,
     for (int k = 0; k < n; k++) {
         next[k] = order->chunk[cuts[k]];
     }
-    for (size_t left = order->n_stretches; left > 0;) {
+    size_t left = order->n_stretches;
+    for (size_t turn = 0; left > 0; turn++) {
+        assert_true(turn <= order->n_stretches); // in each somebody goes on
         for (int k = 0; k < n; k++) {
             const uint32_t begin = order->chunk[cuts[k]], end = order->chunk[cuts[k + 1]];
             bool ready = next[k] < end;
