@@ -94,7 +94,7 @@ static void share(const char *title, const char *name, const char *patch, const 
 // ---- What two threads need to meet ----
 
 #define STEPS 2000
-#define MEETINGS 4 // of a step with F-bar, between its begin and its end
+#define MEETINGS 4 // of a step of one body with F-bar, without loads or rigid bodies
 
 static void meetings(void *context, int own, int there) {
     for (int k = 0; k < MEETINGS; k++) {

@@ -38,9 +38,8 @@ static void list(struct mpm_particles *s, unsigned wanted, struct array *arrays)
 // Processors fetch what lies ahead, past the end of an array too: of the next array the first
 // particles, which another thread may have just changed and then has to fetch back. So there is
 // room for that between the arrays of bodies that threads share.
-#define AHEAD                                                                                      \
-    65 // cache lines: the next page, too; not whole pages, of which all would begin in one set of
-       // the cache
+// Not whole pages either, of which all would begin in one set of the cache.
+#define AHEAD 65    // cache lines: the next page, too
 #define SHARED 1024 // particles or more; does not depend on the threads, as a saved state does not
 
 static size_t array_bytes(size_t capacity, int components) {

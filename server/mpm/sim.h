@@ -58,7 +58,7 @@ struct mpm_turn {
 // What threads do in a step, but for what changes from step to step.
 struct mpm_plan {
     bool fbar;            // in force, and some body takes part
-    bool forces;          // of loads or rigid bodies
+    bool forces;          // of loads, body forces or rigid bodies
     bool clears_sums;     // of the nodes, as after a sort
     struct mpm_span span; // settings of the transfers
     struct mpm_motion motion;

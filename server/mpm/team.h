@@ -17,7 +17,7 @@ struct mpm_seat {
     _Alignas(64) atomic_uint met; // barriers and ends of rounds that the thread has come to
 };
 
-#define MPM_GIVEN 5
+#define MPM_GIVEN 5 // numbers; they fill up the line that says that there is work
 struct mpm_team {
     int n_threads; // wanted; OpenMP may give fewer
     int n_there;   // that stand by; 1 outside mpm_team_hold
@@ -28,8 +28,7 @@ struct mpm_team {
     bool over;
     mpm_team_work *work;
     void *context;
-    double given[MPM_GIVEN]; // (what fills the line) for the work: what changes from one to the
-                             // next, in the same line
+    double given[MPM_GIVEN]; // for the work: what changes from one to the next, in the same line
     _Alignas(64) atomic_uint asleep; // threads that wait in the kernel
 };
 
