@@ -169,6 +169,10 @@ static void join(struct mpm_span_result *joined, const struct mpm_span_result *r
 typedef void span_work(const struct mpm_sim *sim, const struct mpm_span *span,
                        struct mpm_span_result *result);
 
+// Arrays of the grid.
+enum { USES_SUMS = 1, USES_VELOCITY = 2, USES_FBAR = 4 };
+#define FAR_GRID ((size_t)2 << 20) // bytes; as much of it as a core's own cache has room for
+
 struct particles_work {
     const struct mpm_sim *sim;
     const struct mpm_order *order;
@@ -180,9 +184,16 @@ struct particles_work {
     const uint32_t *parts;          // (n_parts + 1) first chunk of each
     int n_parts;                    // one a thread
     double (*mass_dx)[MPM_MAX_DIM]; // of the body's chunks
-    bool gathers;                   // from the grid, before it adds to it
+    unsigned uses;                  // arrays of the grid, as bits
+    bool adds;                      // to the grid
+    bool grid_is_far;               // and has not stayed in the cache
     bool clears_sums;               // which nobody will read any more
 };
+
+static size_t grid_bytes_in_use(const struct mpm_grid *g) {
+    const int width = MPM_NODE + MPM_VELOCITY(g->dim);
+    return (size_t)g->n_slots * (size_t)MPM_BLOCK_NODES(g->dim) * (size_t)width * sizeof(double);
+}
 
 static void work_on(const struct particles_work *w, size_t begin, size_t end, size_t next,
                     struct mpm_span_result *found, double *mass_dx) {
@@ -294,40 +305,45 @@ static void join_found(const struct mpm_sim *sim, struct mpm_span_result *joined
     }
 }
 
-static void lines_ahead(const double *array, size_t doubles, bool writes) {
-    for (size_t i = 0; i < doubles; i += 8) {
+static void lines_ahead(const double *array, uint32_t first, size_t n, int width, bool writes) {
+    const double *from = array + (size_t)first * (size_t)width;
+    for (size_t i = 0; i < n * (size_t)width; i += 8) {
         if (writes) {
-            mpm_prefetch_to_write(array + i);
+            mpm_prefetch_to_write(from + i);
         } else {
-            __builtin_prefetch(array + i);
+            __builtin_prefetch(from + i);
         }
     }
 }
 
-// Nodes that other threads have just changed on the way to the cache, of a stretch that is tied to
-// their parts: those that are theirs, and, if it waits for them, those of its blocks.
-static void nodes_ahead(const struct particles_work *w, uint32_t t, int own) {
+// The nodes of a stretch that comes next, after t, on the way to the cache: of other blocks than t's
+// all, where the grid is too large to have stayed there; those that other threads have just changed,
+// which are theirs; and, if it waits for them, those of its blocks.
+static void nodes_ahead(const struct particles_work *w, uint32_t t, uint32_t next, int own) {
     const struct mpm_grid *g = &w->sim->grid;
-    const struct mpm_stretch *stretch = &w->order->stretch[t];
+    const struct mpm_stretch *stretch = &w->order->stretch[next], *now = &w->order->stretch[t];
     const uint32_t nodes = (uint32_t)MPM_BLOCK_NODES(g->dim), *cut = w->sim->cut;
     const uint32_t reach = (uint32_t)mpm_support(w->sim->def->basis) - 1;
     for (uint32_t block = stretch->first; block <= stretch->last; block++) {
         const uint32_t slot = g->slot[block];
+        const bool far = w->grid_is_far && (block < now->first || block > now->last);
         for (uint32_t k = 0; slot > 0 && k < 1u << g->dim; k++) {
             const uint32_t first = g->near[slot][k], near = first / nodes;
             const bool theirs = near > 0 && (near < cut[own] || near >= cut[own + 1]);
+            const bool awaited = k == 0 && (w->order->ties[next] & MPM_AWAITS);
             if ((k & 1 && block < stretch->last) || // the next one's own
-                (!theirs && (k > 0 || !(w->order->ties[t] & MPM_AWAITS)))) {
+                !(far || theirs || awaited)) {
                 continue;
             }
             const size_t n = k >> (g->dim - 1) ? reach * nodes / MPM_EDGE : nodes; // reached
-            if (w->gathers) {
-                lines_ahead(g->fbar + (size_t)first * (size_t)g->fbar_stride,
-                            n * (size_t)g->fbar_stride, true);
-                lines_ahead(g->velocity + (size_t)first * (size_t)MPM_VELOCITY(g->dim),
-                            n * (size_t)MPM_VELOCITY(g->dim), false);
-            } else {
-                lines_ahead(g->node + (size_t)first * MPM_NODE, n * MPM_NODE, true);
+            if (w->uses & USES_SUMS) {
+                lines_ahead(g->node, first, n, MPM_NODE, true);
+            }
+            if (w->uses & USES_FBAR) {
+                lines_ahead(g->fbar, first, n, g->fbar_stride, w->adds);
+            }
+            if (w->uses & USES_VELOCITY) {
+                lines_ahead(g->velocity, first, n, MPM_VELOCITY(g->dim), false);
             }
         }
     }
@@ -390,9 +406,9 @@ static void work_on_stretches(const struct particles_work *w, int own, int there
             const struct mpm_stretch *stretch = &order->stretch[t];
             if (there > 1) {
                 await_before(w, t, begin, end, &since);
-                if (next != t && order->ties[next]) {
-                    nodes_ahead(w, next, own);
-                }
+            }
+            if (next != t && (w->grid_is_far || order->ties[next])) {
+                nodes_ahead(w, t, next, own);
             }
             work_on(w, stretch->begin, stretch->end, order->stretch[next].begin, &found, NULL);
             work += stretch->end - stretch->begin;
@@ -431,6 +447,10 @@ static void work_on_chunks(const struct particles_work *w, int own, int there) {
         for (size_t i; next_of_part(turn, k == 0, first, last, &at, &i);) {
             const size_t end = i + 1 < order->n_chunks ? chunk_begin(order, i + 1) : n;
             const size_t next = chunk_begin(order, i + 1 < last ? i + 1 : first);
+            for (uint32_t t = order->chunk[i + 1];
+                 w->grid_is_far && i + 1 < last && t < order->chunk[i + 2]; t++) {
+                nodes_ahead(w, t - 1, t, own);
+            }
             work_on(w, chunk_begin(order, i), end, next, &found, w->mass_dx[i]);
             work += end - chunk_begin(order, i);
         }
@@ -440,8 +460,8 @@ static void work_on_chunks(const struct particles_work *w, int own, int there) {
 
 // A thread's share of work that adds to the grid, or that moves particles: then with m dx of these.
 // What is found stays with the threads until the step is over. One body comes after the other.
-static void for_particles(struct step_work *step, size_t body, struct particles_work w, bool adds,
-                          int own, int there) {
+static void for_particles(struct step_work *step, size_t body, struct particles_work w, int own,
+                          int there) {
     struct mpm_sim *sim = step->sim;
     w.span = step->plan.span;
     w.span.s = &sim->sets[body];
@@ -460,7 +480,8 @@ static void for_particles(struct step_work *step, size_t body, struct particles_
     w.parts = parts_of(sim, body);
     w.n_parts = there;
     w.mass_dx = mass_dx_of(sim, body);
-    if (adds) {
+    w.grid_is_far = grid_bytes_in_use(&sim->grid) > FAR_GRID;
+    if (w.adds) {
         w.number = ++step->number;
         work_on_stretches(&w, own, there);
     } else {
@@ -703,7 +724,8 @@ static void transfers(void *context, int own, int there) {
         mpm_team_barrier(sim->team, own, there);
     }
     for (size_t b = 0; b < sim->n_sets; b++) {
-        for_particles(w, b, (struct particles_work){.work = p2g}, true, own, there);
+        const struct particles_work p = {.work = p2g, .uses = USES_SUMS, .adds = true};
+        for_particles(w, b, p, own, there);
     }
     meet(w, MPM_PHASE_P2G, own, there);
     if (w->plan.forces) {
@@ -720,9 +742,11 @@ static void transfers(void *context, int own, int there) {
     // G2P, eqs. 11-17; with F-bar, eq. 19 (Algorithm 1, step 3) with it
     for (size_t b = 0; b < sim->n_sets; b++) {
         const bool averaged = w->plan.fbar && sim->sets[b].wants_fbar;
-        const struct particles_work g = {
-            .work = g2p, .gathers = true, .clears_sums = !w->plan.fbar && b == 0};
-        for_particles(w, b, g, averaged, own, there);
+        const struct particles_work g = {.work = g2p,
+                                         .uses = USES_VELOCITY | (averaged ? USES_FBAR : 0),
+                                         .adds = averaged,
+                                         .clears_sums = !w->plan.fbar && b == 0};
+        for_particles(w, b, g, own, there);
     }
     if (!w->plan.fbar) {
         return;
@@ -734,7 +758,8 @@ static void transfers(void *context, int own, int there) {
     mpm_team_barrier(sim->team, own, there);
     for (size_t b = 0; b < sim->n_sets; b++) {
         if (sim->sets[b].wants_fbar) {
-            for_particles(w, b, (struct particles_work){.work = fbar}, false, own, there);
+            for_particles(w, b, (struct particles_work){.work = fbar, .uses = USES_FBAR}, own,
+                          there);
         }
     }
 }
