@@ -1048,8 +1048,10 @@ MPM_KERNEL void write_records(struct batch *b, const struct mpm_span *span, cons
             mv[d] = m * fetch(in, lane, s->v, dim, d, 0, true);
         }
         const mpm_vec minus_V_over_h = V * -inv_h, V_fbar = fbar ? V : zero;
-        UNROLL for (int k = 0; k < n_sym; k++) { // xx yy zz xy (yz zx)
-            f[k] = minus_V_over_h * fetch(in, lane, s->sigma, n_sym, k, 0, true);
+        UNROLL for (int k = 0; k < n_sym; k++) { // xx yy zz xy (yz zx); in 2D zz acts on no node
+            f[k] = dim == 2 && k == 2
+                       ? zero
+                       : minus_V_over_h * fetch(in, lane, s->sigma, n_sym, k, 0, true);
         }
         if (dim == 2) {
             const mpm_vec record[8] = {m, mv[0], mv[1], V_fbar, f[0], f[3], f[3], f[1]};
