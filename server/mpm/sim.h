@@ -43,6 +43,8 @@ struct mpm_clockwork {
     uint64_t runs_at_sort, runs; // particles of one cell in a row: after the sort, and now
 };
 
+#define MPM_FEW 32 // stretches or chunks: a part of fewer its thread goes through alone
+
 // Which stretch or chunk of a thread's part is next, where the part ends, and what the thread has
 // found; cache lines for each.
 struct mpm_turn {

@@ -213,7 +213,6 @@ static void work_on(const struct particles_work *w, size_t begin, size_t end, si
 // what lies in another core's cache takes longer to fetch than to work on. Of a few it takes none:
 // what the other is at keeps it as long as they would, and to ask takes time, too.
 #define MUCH 3 // one of so many parts is
-#define FEW 32 // stretches or chunks of a part
 
 // A part's next stretch or chunk in the lower half of its turn, the end in the upper one. Its own
 // thread sets it as it begins; until then, as at the end of all work, nothing is left.
@@ -237,7 +236,7 @@ static bool take(struct mpm_turn *turn, bool own, size_t n, size_t *next) {
 // The next of a part [begin, end), `own` or another's; *at goes through an own part of a few.
 static bool next_of_part(struct mpm_turn *turn, bool own, size_t begin, size_t end, size_t *at,
                          size_t *next) {
-    if (end - begin >= FEW) {
+    if (end - begin >= MPM_FEW) {
         return take(turn, own, end - begin, next);
     }
     *next = own ? (*at)++ : end;
@@ -354,7 +353,7 @@ static void nodes_ahead(const struct particles_work *w, uint32_t t, uint32_t nex
 static void await_before(const struct particles_work *w, uint32_t t, size_t begin, size_t end,
                          double *since) {
     const struct mpm_order *order = w->order;
-    const bool few = end - begin < FEW; // all by one thread, one after the other
+    const bool few = end - begin < MPM_FEW; // all by one thread, one after the other
     if (few && !(order->ties[t] & MPM_AWAITS)) {
         return;
     }
@@ -376,7 +375,7 @@ static void await_before(const struct particles_work *w, uint32_t t, size_t begi
 // What nobody looks at is not said: each time, the flags' cache line has to come back from who has
 // looked last.
 static void say_done(const struct particles_work *w, uint32_t t, size_t begin, size_t end) {
-    if (end - begin >= FEW || (w->order->ties[t] & MPM_AWAITED)) {
+    if (end - begin >= MPM_FEW || (w->order->ties[t] & MPM_AWAITED)) {
         atomic_uint *done = &w->order->done[w->order->flag[t]];
         atomic_store_explicit(done, w->number, memory_order_release);
         mpm_team_tell(w->sim->team, done);
@@ -397,7 +396,7 @@ static void work_on_stretches(const struct particles_work *w, int own, int there
         const int part = (own + k) % w->n_parts;
         struct mpm_turn *turn = &w->sim->turns[part];
         const size_t begin = order->chunk[w->parts[part]], end = order->chunk[w->parts[part + 1]];
-        if (k == 0 && end - begin >= FEW) {
+        if (k == 0 && end - begin >= MPM_FEW) {
             begin_turn(turn, begin, end);
         }
         size_t at = begin;
@@ -440,7 +439,7 @@ static void work_on_chunks(const struct particles_work *w, int own, int there) {
         const int part = (own + k) % w->n_parts;
         struct mpm_turn *turn = &w->sim->turns[part];
         const size_t first = w->parts[part], last = w->parts[part + 1];
-        if (k == 0 && last - first >= FEW) {
+        if (k == 0 && last - first >= MPM_FEW) {
             begin_turn(turn, first, last);
         }
         size_t at = first;

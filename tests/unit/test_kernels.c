@@ -1,6 +1,7 @@
 // Kernels in lanes against the plain ones, for every combination; and the same bits for any number
-// of threads, with sorts on the way.
+// of threads, with sorts on the way, and whoever does what.
 #include <math.h>
+#include <sched.h>
 #include <setjmp.h>
 #include <stdarg.h>
 #include <stddef.h>
@@ -92,12 +93,13 @@ static struct mpm_sim *create(enum mpm_isa isa, int n_threads, double speed) {
     // Linear functions blow up where a particle barely reaches a node: with them, none crosses.
     const double calm = world.def.basis == MPM_LINEAR ? 0.05 : 1;
     const double spacing = H / world.body.particles_per_direction;
+    size_t *place = malloc(s->n * sizeof *place);
+    for (size_t p = 0; p < s->n; p++) {
+        place[s->id[p]] = p;
+    }
     seed = 11;
     for (size_t id = 0; id < s->n; id++) {
-        size_t p = 0;
-        while (s->id[p] != id) {
-            p++;
-        }
+        const size_t p = place[id];
         s->V0[p] *= 1 + 0.1 * uniform();
         s->V[p] = s->V0[p];
         for (int d = 0; d < s->dim; d++) {
@@ -105,6 +107,7 @@ static struct mpm_sim *create(enum mpm_isa isa, int n_threads, double speed) {
             s->v[mpm_at(p, s->dim, d)] = calm * (speed * (d == 0) + 0.05 * uniform());
         }
     }
+    free(place);
     sim->c.v2_max = (speed + 1) * (speed + 1);
     assert_true(mpm_sort(sim));
     return sim;
@@ -220,6 +223,145 @@ static void test_kernels_give_the_same_bits_on_any_number_of_threads(void **stat
     }
 }
 
+// Kernels that have threads take over from a part's own one, whatever the machine does: all wait
+// until it has begun, and in the middle it waits for one that takes the next. If none does, because
+// all others have come to the end of the pass, it goes on.
+enum { P2G, G2P, FBAR, N_PASSES };
+static struct {
+    struct mpm_sim *sim;
+    const struct mpm_kernels *kernels; // that do the work
+    int part;                          // whose thread waits; -1: none
+    atomic_uint begun;                 // number of the pass in which it has last begun
+    atomic_int n_taken;                // in how many another has taken over
+} eased;
+
+// Of a part [begin, end) of stretches the first waits for no other part, nor does one wait for any
+// of the second half: else threads would wait here for each other, for ever.
+static bool can_wait(const struct mpm_order *order, size_t begin, size_t end) {
+    bool can = order->ties[order->share[begin]] == 0;
+    for (size_t i = begin + (end - begin) / 2; i < end; i++) {
+        can &= (order->ties[order->share[i]] & MPM_AWAITED) == 0;
+    }
+    return can;
+}
+
+// Whether another thread takes what comes after place i of the part. Relaxed, so that it orders
+// nothing that the step does not.
+static bool is_taken_over(const struct mpm_sim *sim, int part, size_t i) {
+    const struct mpm_seat *seats = sim->team->seats;
+    for (bool alone = false; !alone;) {
+        const unsigned met = atomic_load_explicit(&seats[part].met, memory_order_relaxed);
+        alone = true;
+        for (int k = 0; k < sim->n_shared; k++) {
+            alone &= k == part || atomic_load_explicit(&seats[k].met, memory_order_relaxed) != met;
+        }
+        const uint64_t next =
+            atomic_load_explicit(&sim->turns[part].next, memory_order_relaxed) & UINT32_MAX;
+        if (next > i + 1) {
+            return true;
+        }
+        sched_yield();
+    }
+    return false;
+}
+
+static void ease(const struct mpm_span *span, int pass) {
+    const struct mpm_sim *sim = eased.sim;
+    const struct mpm_order *order = &sim->orders[0];
+    if (eased.part < 0 || eased.part >= sim->n_shared) {
+        return;
+    }
+    const uint32_t *chunk = order->chunk, *cuts = &sim->parts[eased.part];
+    const bool by_chunks = pass == FBAR;
+    const size_t begin = by_chunks ? cuts[0] : chunk[cuts[0]];
+    const size_t end = by_chunks ? cuts[1] : chunk[cuts[1]], middle = begin + (end - begin) / 2;
+    const uint32_t *place = by_chunks ? chunk : order->share;
+    if (!by_chunks && !can_wait(order, begin, end)) {
+        return;
+    }
+    const unsigned number = (unsigned)sim->c.step * N_PASSES + (unsigned)pass + 1;
+    const size_t whole = by_chunks ? MPM_BLOCK : 1; // chunks are of whole blocks
+    if (span->begin == order->stretch[place[begin]].begin / whole * whole) {
+        atomic_store(&eased.begun, number);
+    }
+    while (atomic_load(&eased.begun) != number) {
+        sched_yield();
+    }
+    if (span->begin == order->stretch[place[middle]].begin / whole * whole) {
+        atomic_fetch_add(&eased.n_taken, is_taken_over(sim, eased.part, middle));
+    }
+}
+
+static void eased_p2g(const struct mpm_span *span, struct mpm_span_result *result) {
+    ease(span, P2G);
+    eased.kernels->p2g(span, result);
+}
+
+static void eased_g2p(const struct mpm_span *span, struct mpm_span_result *result) {
+    ease(span, G2P);
+    eased.kernels->g2p(span, result);
+}
+
+static void eased_fbar(const struct mpm_span *span, struct mpm_span_result *result) {
+    ease(span, FBAR);
+    eased.kernels->fbar(span, result);
+}
+
+// Parts of many stretches and chunks; if there is a `small` one, that one has few.
+static void check_parts(const struct mpm_sim *sim, int n, int small) {
+    assert_int_equal(sim->n_shared, n);
+    for (int k = 0; k < n; k++) {
+        const uint32_t *chunk = sim->orders[0].chunk;
+        const uint32_t first = sim->parts[k], last = sim->parts[k + 1];
+        if (k == small) {
+            assert_in_range(chunk[last] - chunk[first], 1, MPM_FEW - 1);
+        } else {
+            assert_true(chunk[last] - chunk[first] >= MPM_FEW && last - first >= MPM_FEW);
+        }
+    }
+}
+
+// Parts of so many stretches that threads take over from each other, in every second step without
+// fail, in all passes. Also with a part of few between, which its thread goes through alone, of the
+// least share that a thread can have: then parts of many wait for one of few, and that for them.
+static void test_kernels_give_the_same_bits_when_threads_take_over(void **state) {
+    (void)state;
+    static const struct {
+        int n_threads, small; // part; -1: all are equal
+    } cases[] = {{2, -1}, {2, 0}, {3, -1}, {3, 1}};
+    const enum mpm_isa isa = mpm_isa_in_use(MPM_ISA_AUTO);
+    const int n_steps = 12;
+    define(2, MPM_GIMP, MPM_FBAR_ZHAO, RUBBER, 60, 4); // 105 stretches of 512 particles and more
+    struct mpm_sim *one = create(isa, 1, 40);
+    advance(one, n_steps);
+    assert_in_range(one->c.steps_since_sort, 1, n_steps - 1);
+    for (size_t q = 0; q < sizeof cases / sizeof *cases; q++) {
+        const int n = cases[q].n_threads, small = cases[q].small;
+        struct mpm_sim *many = create(isa, n, 40);
+        struct mpm_kernels kernels = *many->kernels;
+        kernels.p2g = eased_p2g;
+        kernels.g2p = eased_g2p;
+        kernels.fbar = eased_fbar;
+        eased.sim = many;
+        eased.kernels = many->kernels;
+        atomic_store(&eased.n_taken, 0);
+        atomic_store(&eased.begun, 0);
+        many->kernels = &kernels;
+        for (int k = 0; k < n_steps; k++) {
+            for (int i = 0; small >= 0 && i < n; i++) { // a sort brings them halfway to equal ones
+                many->turns[i].share = i == small ? 1e-9 : 1.0 / (n - 1);
+            }
+            eased.part = k % 2 ? (small + 1) % n : -1;
+            advance(many, 1);
+            check_parts(many, n, small);
+        }
+        assert_int_equal(atomic_load(&eased.n_taken), n_steps / 2 * N_PASSES);
+        same(one, many);
+        mpm_free(many);
+    }
+    mpm_free(one);
+}
+
 // What AUTO comes to is available; what is not there falls back to it.
 static void test_kernels_are_those_of_the_machine(void **state) {
     (void)state;
@@ -237,6 +379,7 @@ int main(int argc, char **argv) {
     const struct CMUnitTest tests[] = {
         cmocka_unit_test(test_kernels_agree_with_the_plain_ones),
         cmocka_unit_test(test_kernels_give_the_same_bits_on_any_number_of_threads),
+        cmocka_unit_test(test_kernels_give_the_same_bits_when_threads_take_over),
         cmocka_unit_test(test_kernels_are_those_of_the_machine),
     };
     cmocka_set_test_filter(argc > 1 ? argv[1] : NULL);
