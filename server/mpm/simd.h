@@ -6,7 +6,7 @@
 // comparison gives an mpm_mask, masks combine with & and |. What one lane gets never depends on
 // what is in the others.
 //
-// This is the only file that knows attributes, vector types and intrinsics.
+// This is the only file with intrinsics, assembly and definitions of vector types.
 #pragma once
 #include <float.h>
 #include <math.h>
@@ -21,6 +21,22 @@
 #define MPM_KERNEL static inline __attribute__((always_inline))
 #define MPM_UNLIKELY(condition) __builtin_expect(!!(condition), 0)
 #define MPM_ALIGNED _Alignas(64) // of an array that mpm_load_aligned reads
+
+// Has a cache line on its way, to be changed here: a common prefetch brings a copy, which to change
+// takes another way to the core that has it.
+MPM_KERNEL void mpm_prefetch_to_write(const void *line) {
+#if defined __x86_64__
+    __asm__ volatile("prefetchw %0" : : "m"(*(const char *)line)); // does nothing where unknown
+#else
+    __builtin_prefetch(line, 1);
+#endif
+}
+// A moment's rest of a thread that looks at a word again and again.
+MPM_KERNEL void mpm_pause(void) {
+#if defined __x86_64__
+    __builtin_ia32_pause();
+#endif
+}
 
 #if MPM_LANES == 1
 

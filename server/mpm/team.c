@@ -17,13 +17,9 @@
 #include <omp.h>
 #endif
 
-#define LOOKS 1000
+#include "server/mpm/simd.h"
 
-static void pause_a_moment(void) {
-#if defined __x86_64__
-    __builtin_ia32_pause();
-#endif
-}
+#define LOOKS 1000
 
 // Who goes to sleep says so and then looks at the word again; who changes the word then looks
 // whether anyone sleeps. One of them sees the other only if neither's store waits behind its look.
@@ -46,7 +42,7 @@ void mpm_team_await(struct mpm_team *team, atomic_uint *word, unsigned old) {
         if (atomic_load_explicit(word, memory_order_acquire) != old) {
             return;
         }
-        pause_a_moment();
+        mpm_pause();
     }
     atomic_fetch_add(&team->asleep, 1);
     fence_all(team);

@@ -32,16 +32,6 @@ struct mpm_team {
     _Alignas(64) atomic_uint asleep; // threads that wait in the kernel
 };
 
-// Has a cache line on its way, to be changed here: a common prefetch brings a copy, which to change
-// takes another way to the core that has it.
-static inline void mpm_prefetch_to_write(const void *line) {
-#if defined __x86_64__
-    __asm__ volatile("prefetchw %0" : : "m"(*(const char *)line)); // does nothing where unknown
-#else
-    __builtin_prefetch(line, 1);
-#endif
-}
-
 // NULL when memory is short.
 struct mpm_team *mpm_team_create(int n_threads);
 void mpm_team_free(struct mpm_team *team);
