@@ -33,15 +33,6 @@ struct mpm_stretch {
 #define MPM_FEWEST 64 // particles of a chunk, and 1/32 of the body's up to MPM_MOST
 #define MPM_MOST 512
 
-// A thread's part of the stretches, while it is shared out.
-struct mpm_part {
-    size_t begin, end;     // stretches
-    size_t n_placed;       // from the begin of its `share` on
-    size_t n_tied;         // to other parts and not placed: up to the end of its `share`
-    size_t untied;         // before this all that are not tied are placed
-    uint64_t clock, looks; // work that it has done, and at which it looks for more
-};
-
 // Ties of a stretch to other parts, by itself or through stretches of its own part, as bits.
 #define MPM_AWAITED 1 // one there waits for it
 #define MPM_AWAITS 2  // it waits for one there
@@ -75,7 +66,7 @@ struct mpm_order {
     uint32_t *flag;  // (n_stretches) where in `done`: a part's side by side, for who waits for many
     uint8_t *ties;   // (n_stretches)
     uint64_t *ended; // (n_stretches) work at which one is over, as if all threads were as fast
-    struct mpm_part *parts; // (most_parts)
+    struct mpm_part *parts; // (most_parts) while they are shared out; stretch.c
     int most_parts;
 };
 

@@ -14,6 +14,16 @@
 #define CUT_WORK 32  // a cut within a row, along which more nodes are common to the parts
 #define HOP_WORK 128 // until what one thread has done is where another needs it
 
+// A thread's part of the stretches, while it is shared out.
+struct mpm_part {
+    size_t begin, end;  // stretches
+    size_t n_placed;    // from the begin of its `share` on
+    size_t n_tied;      // to other parts and not placed: up to the end of its `share`
+    size_t untied;      // before this all that are not tied are placed
+    uint64_t clock;     // work at which its thread is done with what is placed
+    uint64_t next_look; // and at which it looks for more
+};
+
 void mpm_order_free(struct mpm_order *order) {
     free(order->tile);
     free(order->stretch);
@@ -354,8 +364,8 @@ static uint64_t ready_at(const struct mpm_order *order, const struct mpm_part *p
 }
 
 static void place(struct mpm_order *order, struct mpm_part *part, uint32_t t) {
-    part->clock = part->looks + order->stretch[t].end - order->stretch[t].begin + STRETCH_WORK;
-    part->looks = part->clock;
+    part->clock = part->next_look + order->stretch[t].end - order->stretch[t].begin + STRETCH_WORK;
+    part->next_look = part->clock;
     order->ended[t] = part->clock;
     order->share[part->begin + part->n_placed++] = t;
 }
@@ -409,11 +419,11 @@ static bool place_next(struct mpm_order *order, struct mpm_part *part) {
     }
     for (size_t i = 0; i < part->n_tied; i++) {
         const uint64_t ready = ready_at(order, part, tied[i]);
-        if (ready <= part->looks && (order->ties[tied[i]] & MPM_AWAITED)) {
+        if (ready <= part->next_look && (order->ties[tied[i]] & MPM_AWAITED)) {
             place_tied(order, part, i);
             return true;
         }
-        next = ready <= part->looks && next == part->n_tied ? i : next;
+        next = ready <= part->next_look && next == part->n_tied ? i : next;
         soonest = ready < soonest ? ready : soonest;
     }
     if (place_untied(order, part)) {
@@ -423,7 +433,7 @@ static bool place_next(struct mpm_order *order, struct mpm_part *part) {
         place_tied(order, part, next);
         return true;
     }
-    part->looks = soonest;
+    part->next_look = soonest;
     return false;
 }
 
@@ -450,14 +460,14 @@ void mpm_order_share(struct mpm_order *order, const uint32_t *cuts, int n) {
         struct mpm_part *part = NULL; // that looks first
         for (int k = 0; k < n; k++) {
             if (parts[k].begin + parts[k].n_placed < parts[k].end &&
-                (!part || parts[k].looks < part->looks)) {
+                (!part || parts[k].next_look < part->next_look)) {
                 part = &parts[k];
             }
         }
         if (place_next(order, part)) {
             placed++;
             for (int k = 0; k < n; k++) {
-                parts[k].looks = parts[k].clock; // it may be able to go on
+                parts[k].next_look = parts[k].clock; // it may be able to go on
             }
         }
     }
