@@ -45,10 +45,11 @@ struct mpm_clockwork {
 
 #define MPM_FEW 32 // stretches or chunks: a part of fewer its thread goes through alone
 
-// Which stretch or chunk of a thread's part is next, where the part ends, and what the thread has
-// found; cache lines for each.
+// A thread's part and what the thread has found; cache lines for each.
 struct mpm_turn {
-    _Alignas(128) _Atomic uint64_t next;       // and the end
+    // Which stretch or chunk of the part is next, and the end: if it has MPM_FEW or more. With
+    // fewer only the thread knows, and here is left what was of an earlier pass: nothing to take.
+    _Alignas(128) _Atomic uint64_t next;
     _Alignas(64) struct mpm_span_result found; // in this step, but for sums
     int fault_pass;                            // if it found a fault: in which pass
     size_t fault_body;                         // and whose particle's
