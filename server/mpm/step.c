@@ -1,12 +1,10 @@
 // One explicit time step, update stress last: Zhao, Jiang, Choo, section 2.2 and Algorithm 1.
 // The stages below are those of docs/method.md, in its order; equation numbers are the paper's.
-#include <stdatomic.h>
 #include <stdint.h>
 #include <stdio.h>
 #include <string.h>
 
-#include "server/mpm/basis.h"
-#include "server/mpm/sim.h"
+#include "server/mpm/pass.h"
 
 #define UNSTABLE_CFL                                                                               \
     1.0 // no basis is stable at dt >= 0.9 h/c (docs/method.md): beyond this it is not tried
@@ -14,73 +12,6 @@
 // What is told anew in every step (team->given); the third to fifth are gravity.
 enum given { GIVEN_DT, GIVEN_PASS, GIVEN_GRAVITY };
 _Static_assert(GIVEN_GRAVITY + MPM_MAX_DIM <= MPM_GIVEN, "room for gravity");
-
-// What a thread knows of a step.
-struct step_work {
-    struct mpm_sim *sim;
-    struct mpm_plan plan;
-    unsigned number; // of the last pass that added to the grid
-    int pass;        // of the step, from 0; a body's own
-};
-
-static uint32_t *parts_of(const struct mpm_sim *sim, size_t body) {
-    return sim->parts + body * ((size_t)sim->def->n_threads + 1);
-}
-
-// What threads get through in a second differs: with what flows in their parts, and with what else
-// wants their cores. So each one's share follows what it did with the last; nothing that is
-// computed depends on the shares.
-static void follow_speeds(struct mpm_sim *sim, int n) {
-    double all = 0, speeds = 0;
-    for (int k = 0; k < n; k++) {
-        struct mpm_turn *turn = &sim->turns[k];
-        turn->speed = turn->seconds > 0 ? turn->work / turn->seconds : 0;
-        turn->share = turn->share > 0 ? turn->share : 1.0 / n;
-        speeds += turn->speed;
-        turn->work = turn->seconds = 0;
-    }
-    for (int k = 0; k < n; k++) {
-        struct mpm_turn *turn = &sim->turns[k];
-        const double wanted = turn->speed > 0 ? turn->speed / speeds : 1.0 / n;
-        turn->share += 0.5 * (fmin(fmax(wanted, 0.5 / n), 2.0 / n) - turn->share);
-        all += turn->share;
-    }
-    for (int k = 0; k < n; k++) {
-        sim->turns[k].share /= all;
-    }
-}
-
-static void share_out(struct mpm_sim *sim) {
-    const int n = sim->team->n_there;
-    if (sim->n_shared == n) {
-        return;
-    }
-    follow_speeds(sim, n);
-    size_t most = 0;
-    for (size_t b = 0; b < sim->n_sets; b++) {
-        struct mpm_order *order = &sim->orders[b];
-        uint32_t *parts = parts_of(sim, b);
-        double before = 0;
-        most = sim->sets[b].n > sim->sets[most].n ? b : most;
-        for (int k = 0; k < n; k++) {
-            const uint32_t cut = (uint32_t)mpm_order_cut(order, before);
-            parts[k] = k > 0 && cut < parts[k - 1] ? parts[k - 1] : cut;
-            before += sim->turns[k].share;
-        }
-        parts[n] = (uint32_t)order->n_chunks;
-        mpm_order_share(order, parts, n);
-    }
-    const struct mpm_order *order = &sim->orders[most];
-    for (int k = 1; k < n; k++) {
-        const size_t t = order->chunk[parts_of(sim, most)[k]];
-        const uint32_t slot =
-            t < order->n_stretches ? sim->grid.slot[order->stretch[t].first] : sim->grid.n_slots;
-        sim->cut[k] = slot > sim->cut[k - 1] ? slot : sim->cut[k - 1];
-    }
-    sim->cut[n] = sim->grid.n_slots;
-    sim->walls_in_common = mpm_walls_share(sim->walls, sim->n_walls, &sim->grid, sim->cut, n);
-    sim->n_shared = n;
-}
 
 // Work on nodes. Each thread has the blocks around its part of the particles, so that most of what
 // it adds to the grid, moves and gathers stays with it: to fetch what another core has just changed
@@ -100,7 +31,7 @@ static void clear_sums(const struct mpm_sim *sim, int own) {
 }
 
 // What walls have in common is done by one thread: no other touches it before the barrier.
-static void move_nodes(const struct step_work *w, int own, int there) {
+static void move_nodes(const struct mpm_step_work *w, int own, int there) {
     struct mpm_sim *sim = w->sim;
     struct mpm_grid *grid = &sim->grid;
     const double *g = w->plan.motion.gravity, dt = w->plan.motion.dt;
@@ -148,357 +79,6 @@ static void divide_nodes(struct mpm_sim *sim, int own, int there) {
             mpm_walls_mirror_fbar(sim->walls, sim->n_walls, grid, there);
         }
     }
-}
-
-// All but the sums, which are not the same in any order.
-static void join(struct mpm_span_result *joined, const struct mpm_span_result *r, int dim) {
-    for (int d = 0; d < dim; d++) {
-        joined->min[d] = r->min[d] < joined->min[d] ? r->min[d] : joined->min[d];
-        joined->max[d] = r->max[d] > joined->max[d] ? r->max[d] : joined->max[d];
-    }
-    joined->v2_max = r->v2_max > joined->v2_max ? r->v2_max : joined->v2_max;
-    joined->dx_max = r->dx_max > joined->dx_max ? r->dx_max : joined->dx_max;
-    joined->n_runs += r->n_runs;
-    if (r->bad < joined->bad) {
-        joined->bad = r->bad;
-        joined->status = r->status;
-        joined->value = r->value;
-    }
-}
-
-typedef void span_work(const struct mpm_sim *sim, const struct mpm_span *span,
-                       struct mpm_span_result *result);
-
-// Arrays of the grid.
-enum { USES_SUMS = 1, USES_VELOCITY = 2, USES_FBAR = 4 };
-#define FAR_GRID ((size_t)2 << 20) // bytes; as much of it as a core's own cache has room for
-
-struct particles_work {
-    const struct mpm_sim *sim;
-    const struct mpm_order *order;
-    struct mpm_span span;
-    span_work *work;
-    size_t body;
-    int pass;                       // of the step, from 0; a body's own
-    unsigned number;                // that no pass before had, of those that add to the grid
-    const uint32_t *parts;          // (n_parts + 1) first chunk of each
-    int n_parts;                    // one a thread
-    double (*mass_dx)[MPM_MAX_DIM]; // of the body's chunks
-    unsigned uses;                  // arrays of the grid, as bits
-    bool adds;                      // to the grid
-    bool grid_is_far;               // and has not stayed in the cache
-    bool clears_sums;               // which nobody will read any more
-};
-
-static size_t grid_bytes_in_use(const struct mpm_grid *g) {
-    const int width = MPM_NODE + MPM_VELOCITY(g->dim);
-    return (size_t)g->n_slots * (size_t)MPM_BLOCK_NODES(g->dim) * (size_t)width * sizeof(double);
-}
-
-static void work_on(const struct particles_work *w, size_t begin, size_t end, size_t next,
-                    struct mpm_span_result *found, double *mass_dx) {
-    struct mpm_span span = w->span;
-    struct mpm_span_result result;
-    span.begin = begin;
-    span.end = end;
-    span.next = next;
-    w->work(w->sim, &span, &result);
-    join(found, &result, span.s->dim);
-    if (mass_dx) {
-        memcpy(mass_dx, result.mass_dx, sizeof result.mass_dx);
-    }
-}
-
-// A thread takes over from another only while much of its part is left, as when it lost its core:
-// what lies in another core's cache takes longer to fetch than to work on. Of a few it takes none:
-// what the other is at keeps it as long as they would, and to ask takes time, too.
-#define MUCH 3 // one of so many parts is
-
-// A part's next stretch or chunk in the lower half of its turn, the end in the upper one. Its own
-// thread sets it as it begins; until then, as at the end of all work, nothing is left.
-static void begin_turn(struct mpm_turn *turn, size_t begin, size_t end) {
-    atomic_store_explicit(&turn->next, (uint64_t)end << 32 | begin, memory_order_release);
-}
-
-// The next of a part of n, if there is one.
-static bool take(struct mpm_turn *turn, bool own, size_t n, size_t *next) {
-    if (!own) {
-        const uint64_t now = atomic_load_explicit(&turn->next, memory_order_relaxed);
-        if ((now & UINT32_MAX) + n / MUCH + 1 >= now >> 32) {
-            return false;
-        }
-    }
-    const uint64_t now = atomic_fetch_add_explicit(&turn->next, 1, memory_order_acquire);
-    *next = now & UINT32_MAX;
-    return *next < now >> 32;
-}
-
-// The next of a part [begin, end), `own` or another's; *at goes through an own part of a few.
-static bool next_of_part(struct mpm_turn *turn, bool own, size_t begin, size_t end, size_t *at,
-                         size_t *next) {
-    if (end - begin >= MPM_FEW) {
-        return take(turn, own, end - begin, next);
-    }
-    *next = own ? (*at)++ : end;
-    return *next < end;
-}
-
-static double now_or_zero(const struct mpm_sim *sim) {
-    return sim->def->clock ? sim->def->clock() : 0;
-}
-
-// What a thread has found in the step so far, on how many particles, and since when: for
-// follow_speeds. Of faults the first pass' counts.
-static void end_turn(const struct particles_work *w, int own, struct mpm_span_result *found,
-                     size_t work, double since) {
-    struct mpm_turn *turn = &w->sim->turns[own];
-    if (w->pass == 0) {
-        turn->found = *found;
-        turn->fault_pass = 0;
-        turn->fault_body = w->body;
-    } else {
-        if (turn->found.bad != SIZE_MAX) {
-            found->bad = SIZE_MAX;
-        } else {
-            turn->fault_pass = w->pass;
-            turn->fault_body = w->body;
-        }
-        join(&turn->found, found, w->span.s->dim);
-    }
-    if (since > 0) {
-        turn->work += (double)work;
-        turn->seconds += now_or_zero(w->sim) - since;
-    }
-}
-
-static double (*mass_dx_of(const struct mpm_sim *sim, size_t body))[MPM_MAX_DIM] {
-    return sim->mass_dx + sim->sets[body].first_id / MPM_FEWEST + body;
-}
-
-// What all have found in the step: of faults the first pass' first, by its particle's id; and the
-// sums, in the order of the chunks.
-static void join_found(const struct mpm_sim *sim, struct mpm_span_result *joined) {
-    int pass = 0;
-    size_t body = 0;
-    for (int k = 0; k < sim->team->n_there; k++) {
-        const struct mpm_turn *turn = &sim->turns[k];
-        struct mpm_span_result found = turn->found;
-        if (found.bad != SIZE_MAX && (joined->bad == SIZE_MAX || turn->fault_pass < pass)) {
-            joined->bad = SIZE_MAX;
-            pass = turn->fault_pass;
-            body = turn->fault_body;
-        } else if (turn->fault_pass > pass) {
-            found.bad = SIZE_MAX;
-        }
-        join(joined, &found, sim->grid.dim);
-    }
-    if (joined->bad != SIZE_MAX) {
-        joined->bad = sim->sets[body].first_id + sim->sets[body].id[joined->bad];
-    }
-    for (size_t b = 0; b < sim->n_sets; b++) {
-        for (size_t k = 0; k < sim->orders[b].n_chunks; k++) {
-            for (int d = 0; d < sim->grid.dim; d++) {
-                joined->mass_dx[d] += mass_dx_of(sim, b)[k][d];
-            }
-        }
-    }
-}
-
-static void lines_ahead(const double *array, uint32_t first, size_t n, int width, bool writes) {
-    const double *from = array + (size_t)first * (size_t)width;
-    for (size_t i = 0; i < n * (size_t)width; i += 8) {
-        if (writes) {
-            mpm_prefetch_to_write(from + i);
-        } else {
-            __builtin_prefetch(from + i);
-        }
-    }
-}
-
-// The nodes of a stretch that comes next, after t, on the way to the cache: of other blocks than t's
-// all, where the grid is too large to have stayed there; those that other threads have just changed,
-// which are theirs; and, if it waits for them, those of its blocks.
-static void nodes_ahead(const struct particles_work *w, uint32_t t, uint32_t next, int own) {
-    const struct mpm_grid *g = &w->sim->grid;
-    const struct mpm_stretch *stretch = &w->order->stretch[next], *now = &w->order->stretch[t];
-    const uint32_t nodes = (uint32_t)MPM_BLOCK_NODES(g->dim), *cut = w->sim->cut;
-    const uint32_t reach = (uint32_t)mpm_support(w->sim->def->basis) - 1;
-    for (uint32_t block = stretch->first; block <= stretch->last; block++) {
-        const uint32_t slot = g->slot[block];
-        const bool far = w->grid_is_far && (block < now->first || block > now->last);
-        for (uint32_t k = 0; slot > 0 && k < 1u << g->dim; k++) {
-            const uint32_t first = g->near[slot][k], near = first / nodes;
-            const bool theirs = near > 0 && (near < cut[own] || near >= cut[own + 1]);
-            const bool awaited = k == 0 && (w->order->ties[next] & MPM_AWAITS);
-            if ((k & 1 && block < stretch->last) || // the next one's own
-                !(far || theirs || awaited)) {
-                continue;
-            }
-            const size_t n = k >> (g->dim - 1) ? reach * nodes / MPM_EDGE : nodes; // reached
-            if (w->uses & USES_SUMS) {
-                lines_ahead(g->node, first, n, MPM_NODE, true);
-            }
-            if (w->uses & USES_FBAR) {
-                lines_ahead(g->fbar, first, n, g->fbar_stride, w->adds);
-            }
-            if (w->uses & USES_VELOCITY) {
-                lines_ahead(g->velocity, first, n, MPM_VELOCITY(g->dim), false);
-            }
-        }
-    }
-}
-
-// Waits until those are done that come before a stretch of the part [begin, end), and are not
-// surely done by who comes to it. Adds the seconds that it takes to *since.
-static void await_before(const struct particles_work *w, uint32_t t, size_t begin, size_t end,
-                         double *since) {
-    const struct mpm_order *order = w->order;
-    const bool few = end - begin < MPM_FEW; // all by one thread, one after the other
-    if (few && !(order->ties[t] & MPM_AWAITS)) {
-        return;
-    }
-    for (uint32_t b = order->before_begin[t]; b < order->before_begin[t + 1]; b++) {
-        const uint32_t q = order->before[b];
-        if (few && q >= begin && q < end) {
-            continue;
-        }
-        atomic_uint *done = &order->done[order->flag[q]];
-        for (unsigned pass;
-             (pass = atomic_load_explicit(done, memory_order_acquire)) != w->number;) {
-            const double waits = now_or_zero(w->sim);
-            mpm_team_await(w->sim->team, done, pass);
-            *since += now_or_zero(w->sim) - waits;
-        }
-    }
-}
-
-// What nobody looks at is not said: each time, the flags' cache line has to come back from who has
-// looked last.
-static void say_done(const struct particles_work *w, uint32_t t, size_t begin, size_t end) {
-    if (end - begin >= MPM_FEW || (w->order->ties[t] & MPM_AWAITED)) {
-        atomic_uint *done = &w->order->done[w->order->flag[t]];
-        atomic_store_explicit(done, w->number, memory_order_release);
-        mpm_team_tell(w->sim->team, done);
-    }
-}
-
-// Work that adds to the grid goes by stretches. One waits for those near it that come before it, so
-// that every node's sum has one order whatever the number of threads (order.h). Each thread does
-// its own part first, then what others are far from. Nobody waits for one that nobody will do: the
-// parts' orders are those of one order of all stretches (stretch.c), so that of those that are not
-// done the first waits for none, and is always taken by the one whose part it is, if not before.
-static void work_on_stretches(const struct particles_work *w, int own, int there) {
-    const struct mpm_order *order = w->order;
-    struct mpm_span_result found = mpm_nothing_found();
-    double since = there > 1 ? now_or_zero(w->sim) : 0;
-    size_t work = 0;
-    for (int k = 0; k < w->n_parts; k++) {
-        const int part = (own + k) % w->n_parts;
-        struct mpm_turn *turn = &w->sim->turns[part];
-        const size_t begin = order->chunk[w->parts[part]], end = order->chunk[w->parts[part + 1]];
-        if (k == 0 && end - begin >= MPM_FEW) {
-            begin_turn(turn, begin, end);
-        }
-        size_t at = begin;
-        for (size_t i; next_of_part(turn, k == 0, begin, end, &at, &i);) {
-            const uint32_t t = order->share[i], next = order->share[i + 1 < end ? i + 1 : i];
-            const struct mpm_stretch *stretch = &order->stretch[t];
-            if (there > 1) {
-                await_before(w, t, begin, end, &since);
-            }
-            if (next != t && (w->grid_is_far || order->ties[next])) {
-                nodes_ahead(w, t, next, own);
-            }
-            work_on(w, stretch->begin, stretch->end, order->stretch[next].begin, &found, NULL);
-            work += stretch->end - stretch->begin;
-            if (there > 1) {
-                say_done(w, t, begin, end);
-            }
-        }
-    }
-    end_turn(w, own, &found, work, since);
-}
-
-// In whole blocks of particles: of one that two stretches share no lane is idle.
-static size_t chunk_begin(const struct mpm_order *order, size_t chunk) {
-    return order->stretch[order->chunk[chunk]].begin / MPM_BLOCK * MPM_BLOCK;
-}
-
-// All other work goes by chunks, in the same parts. They do not take equal time, since what flows
-// costs more.
-static void work_on_chunks(const struct particles_work *w, int own, int there) {
-    const struct mpm_order *order = w->order;
-    const size_t n = w->span.s->n;
-    if (w->clears_sums) {
-        clear_sums(w->sim, own);
-    }
-    struct mpm_span_result found = mpm_nothing_found();
-    double since = there > 1 ? now_or_zero(w->sim) : 0;
-    size_t work = 0;
-    for (int k = 0; k < w->n_parts; k++) {
-        const int part = (own + k) % w->n_parts;
-        struct mpm_turn *turn = &w->sim->turns[part];
-        const size_t first = w->parts[part], last = w->parts[part + 1];
-        if (k == 0 && last - first >= MPM_FEW) {
-            begin_turn(turn, first, last);
-        }
-        size_t at = first;
-        for (size_t i; next_of_part(turn, k == 0, first, last, &at, &i);) {
-            const size_t end = i + 1 < order->n_chunks ? chunk_begin(order, i + 1) : n;
-            const size_t next = chunk_begin(order, i + 1 < last ? i + 1 : first);
-            for (uint32_t t = order->chunk[i + 1];
-                 w->grid_is_far && i + 1 < last && t < order->chunk[i + 2]; t++) {
-                nodes_ahead(w, t - 1, t, own);
-            }
-            work_on(w, chunk_begin(order, i), end, next, &found, w->mass_dx[i]);
-            work += end - chunk_begin(order, i);
-        }
-    }
-    end_turn(w, own, &found, work, since);
-}
-
-// A thread's share of work that adds to the grid, or that moves particles: then with m dx of these.
-// What is found stays with the threads until the step is over. One body comes after the other.
-static void for_particles(struct step_work *step, size_t body, struct particles_work w, int own,
-                          int there) {
-    struct mpm_sim *sim = step->sim;
-    w.span = step->plan.span;
-    w.span.s = &sim->sets[body];
-    w.span.grid = &sim->grid;
-    w.span.fbar = step->plan.fbar && sim->sets[body].wants_fbar;
-    w.sim = sim;
-    w.order = &sim->orders[body];
-    if (body > 0) {
-        mpm_team_barrier(sim->team, own, there);
-    }
-    if (w.order->n_stretches == 0) {
-        return;
-    }
-    w.body = body;
-    w.pass = step->pass++;
-    w.parts = parts_of(sim, body);
-    w.n_parts = there;
-    w.mass_dx = mass_dx_of(sim, body);
-    w.grid_is_far = grid_bytes_in_use(&sim->grid) > FAR_GRID;
-    if (w.adds) {
-        w.number = ++step->number;
-        work_on_stretches(&w, own, there);
-    } else {
-        work_on_chunks(&w, own, there);
-    }
-}
-
-static void p2g(const struct mpm_sim *sim, const struct mpm_span *span, struct mpm_span_result *r) {
-    sim->kernels->p2g(span, r);
-}
-
-static void g2p(const struct mpm_sim *sim, const struct mpm_span *span, struct mpm_span_result *r) {
-    sim->kernels->g2p(span, r);
-}
-
-static void fbar(const struct mpm_sim *sim, const struct mpm_span *span,
-                 struct mpm_span_result *r) {
-    sim->kernels->fbar(span, r);
 }
 
 static enum mpm_status step_failure(const struct mpm_sim *sim, enum mpm_status status, double time,
@@ -573,7 +153,7 @@ static enum mpm_status check_result(const struct mpm_sim *sim, const struct mpm_
 
 // Adds the time since the end of the last one to a phase.
 static void charge(struct mpm_sim *sim, enum mpm_phase phase) {
-    const double now = now_or_zero(sim);
+    const double now = mpm_now_or_zero(sim);
     sim->phase_seconds[phase] += now - sim->phase_begin;
     sim->phase_begin = now;
 }
@@ -701,7 +281,7 @@ static bool takes_part_in_fbar(const struct mpm_sim *sim) {
 }
 
 // All have done a phase: who comes next needs what others have done in it.
-static void meet(const struct step_work *w, enum mpm_phase done, int own, int there) {
+static void meet(const struct mpm_step_work *w, enum mpm_phase done, int own, int there) {
     mpm_team_barrier(w->sim->team, own, there);
     if (own == 0) {
         charge(w->sim, done);
@@ -712,19 +292,20 @@ static void meet(const struct step_work *w, enum mpm_phase done, int own, int th
 static void transfers(void *context, int own, int there) {
     struct mpm_sim *sim = context;
     const double *given = sim->team->given;
-    struct step_work work = {.sim = sim, .plan = sim->plan, .number = (unsigned)given[GIVEN_PASS]};
-    struct step_work *w = &work;
+    struct mpm_step_work work = {
+        .sim = sim, .plan = sim->plan, .number = (unsigned)given[GIVEN_PASS]};
+    struct mpm_step_work *w = &work;
     w->plan.span.dt = w->plan.motion.dt = given[GIVEN_DT];
     memcpy(w->plan.motion.gravity, given + GIVEN_GRAVITY, sizeof w->plan.motion.gravity);
 
     // P2G, eqs. 7, 8, 10
+    const struct mpm_pass p2g = {.work = sim->kernels->p2g, .uses = MPM_USES_SUMS, .adds = true};
     if (w->plan.clears_sums) {
         clear_sums(sim, own);
         mpm_team_barrier(sim->team, own, there);
     }
     for (size_t b = 0; b < sim->n_sets; b++) {
-        const struct particles_work p = {.work = p2g, .uses = USES_SUMS, .adds = true};
-        for_particles(w, b, p, own, there);
+        mpm_pass(w, b, &p2g, own, there);
     }
     meet(w, MPM_PHASE_P2G, own, there);
     if (w->plan.forces) {
@@ -739,13 +320,15 @@ static void transfers(void *context, int own, int there) {
     meet(w, MPM_PHASE_GRID, own, there);
 
     // G2P, eqs. 11-17; with F-bar, eq. 19 (Algorithm 1, step 3) with it
+    if (!w->plan.fbar) {
+        clear_sums(sim, own); // which nobody will read any more
+    }
     for (size_t b = 0; b < sim->n_sets; b++) {
         const bool averaged = w->plan.fbar && sim->sets[b].wants_fbar;
-        const struct particles_work g = {.work = g2p,
-                                         .uses = USES_VELOCITY | (averaged ? USES_FBAR : 0),
-                                         .adds = averaged,
-                                         .clears_sums = !w->plan.fbar && b == 0};
-        for_particles(w, b, g, own, there);
+        const struct mpm_pass g2p = {.work = sim->kernels->g2p,
+                                     .uses = MPM_USES_VELOCITY | (averaged ? MPM_USES_FBAR : 0),
+                                     .adds = averaged};
+        mpm_pass(w, b, &g2p, own, there);
     }
     if (!w->plan.fbar) {
         return;
@@ -755,10 +338,10 @@ static void transfers(void *context, int own, int there) {
     // F-bar, eqs. 20-27: Algorithm 1, steps 4 and 5
     divide_nodes(sim, own, there);
     mpm_team_barrier(sim->team, own, there);
+    const struct mpm_pass fbar = {.work = sim->kernels->fbar, .uses = MPM_USES_FBAR};
     for (size_t b = 0; b < sim->n_sets; b++) {
         if (sim->sets[b].wants_fbar) {
-            for_particles(w, b, (struct particles_work){.work = fbar, .uses = USES_FBAR}, own,
-                          there);
+            mpm_pass(w, b, &fbar, own, there);
         }
     }
 }
@@ -805,7 +388,7 @@ static enum mpm_status step(struct mpm_sim *sim, struct mpm_error *err) {
     }
     double gravity[MPM_MAX_DIM] = {0};
     mpm_gravity_at(sim, sim->c.time, gravity);
-    sim->phase_begin = now_or_zero(sim);
+    sim->phase_begin = mpm_now_or_zero(sim);
     if (sort_is_due(sim)) {
         if (!mpm_sort(sim)) {
             return step_failure(sim, MPM_ERR_MEMORY, time, -1, "bytes of particles and grid",
@@ -817,10 +400,10 @@ static enum mpm_status step(struct mpm_sim *sim, struct mpm_error *err) {
     if (sim->grid.fbar_stride != mpm_fbar_scalars(now->fbar.scheme)) {
         sim->grid.fbar_stride = mpm_fbar_scalars(now->fbar.scheme);
     }
-    share_out(sim);
+    mpm_share_out(sim);
     run_transfers(sim, dt, gravity);
     struct mpm_span_result found = mpm_nothing_found();
-    join_found(sim, &found);
+    mpm_join_found(sim, &found);
     sim->c.runs = found.n_runs;
     sim->c.runs_at_sort = sim->c.steps_since_sort == 0 ? found.n_runs : sim->c.runs_at_sort;
 

@@ -12,7 +12,7 @@
 
 #include <cmocka.h>
 
-#include "server/mpm/sim.h"
+#include "server/mpm/pass.h"
 
 #define H 0.125
 enum { RUBBER, FLUID, CLAY, N_KINDS };
@@ -223,6 +223,27 @@ static void test_kernels_give_the_same_bits_on_any_number_of_threads(void **stat
     }
 }
 
+// Nodes that are fetched ahead, in all passes, also of parts that threads take over.
+static void test_kernels_give_the_same_bits_of_many_nodes_on_any_number_of_threads(void **state) {
+    (void)state;
+    static const int schemes[] = {MPM_FBAR_OFF, MPM_FBAR_ANCHORED};
+    for (int dim = 2; dim <= 3; dim++) {
+        for (size_t k = 0; k < sizeof schemes / sizeof *schemes; k++) {
+            define(dim, MPM_GIMP, schemes[k], CLAY, dim == 2 ? 180 : 30, 1);
+            struct mpm_sim *one = create(MPM_ISA_BASELINE, 1, 8);
+            assert_true(mpm_grid_is_far(&one->grid));
+            advance(one, 3);
+            for (int n = 2; n <= 3; n++) {
+                struct mpm_sim *many = create(MPM_ISA_BASELINE, n, 8);
+                advance(many, 3);
+                same(one, many);
+                mpm_free(many);
+            }
+            mpm_free(one);
+        }
+    }
+}
+
 // Kernels that have threads take over from a part's own one, whatever the machine does: all wait
 // until it has begun, and in the middle it waits for one that takes the next. If none does, because
 // all others have come to the end of the pass, it goes on.
@@ -379,6 +400,7 @@ int main(int argc, char **argv) {
     const struct CMUnitTest tests[] = {
         cmocka_unit_test(test_kernels_agree_with_the_plain_ones),
         cmocka_unit_test(test_kernels_give_the_same_bits_on_any_number_of_threads),
+        cmocka_unit_test(test_kernels_give_the_same_bits_of_many_nodes_on_any_number_of_threads),
         cmocka_unit_test(test_kernels_give_the_same_bits_when_threads_take_over),
         cmocka_unit_test(test_kernels_are_those_of_the_machine),
     };

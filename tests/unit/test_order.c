@@ -108,7 +108,7 @@ static void check_shares(struct mpm_order *order, int n_parts) {
         }
     }
     // Who waits for a stretch of another part knows that it has to look, and whose it is that it
-    // has to be told (step.c: await_before, say_done).
+    // has to be told (pass.c: await_before, say_done).
     for (size_t t = 0; t < order->n_stretches; t++) {
         for (uint32_t b = order->before_begin[t]; b < order->before_begin[t + 1]; b++) {
             const uint32_t q = order->before[b];
