@@ -12,9 +12,9 @@ MPM_KERNEL void mpm_half_log(const mpm_vec *b, mpm_vec *e, const int dim);
 // exp(2 e), its inverse.
 MPM_KERNEL void mpm_exp_twice(const mpm_vec *e, mpm_vec *b, const int dim);
 // The same of a strain whose deviator has shrunk: exp(2 (mean 1 + (1 - part) D)), from b = exp(2
-// (mean 1 + D)), which is known.
-MPM_KERNEL void mpm_exp_twice_less(const mpm_vec *b, const mpm_vec *D, mpm_vec part, mpm_vec mean,
-                                   mpm_vec *less, const int dim);
+// (mean 1 + D)), which is known and may be overwritten, and norm2 = |D|^2.
+MPM_KERNEL void mpm_exp_twice_less(const mpm_vec *b, const mpm_vec *D, mpm_vec norm2, mpm_vec part,
+                                   mpm_vec mean, mpm_vec *less, const int dim);
 
 // The same by eigenvalues, for any size, of those of n_lanes tensors whose bit is set in `lanes`:
 // component k of tensor i is b[k * n_lanes + i].
@@ -149,33 +149,36 @@ MPM_KERNEL void mpm_exp_twice(const mpm_vec *e, mpm_vec *b, const int dim) {
     mpm_far_lanes(mpm_exp_twice_far, norm2 <= MPM_SERIES_REACH * MPM_SERIES_REACH, e, b, dim);
 }
 
-// b exp(A) with A = -2 part D, which commutes with b. The series to A^7, by powers of A's
-// invariants J2 = -I2 and J3 = I3, all that does not depend on `part` apart: it comes late.
-#define MPM_SHORT_REACH 0.028 // of A's norm: the next term is 1e-17
-MPM_KERNEL void mpm_exp_twice_less(const mpm_vec *b, const mpm_vec *D, mpm_vec part, mpm_vec mean,
-                                   mpm_vec *less, const int dim) {
-    mpm_vec bD[6], bD2[6];
-    mpm_commuting_product(b, D, bD, dim);
-    mpm_commuting_product(bD, D, bD2, dim);
-    mpm_vec norm2 = mpm_splat(0);
-    for (int k = 0; k < MPM_SYM(dim); k++) {
-        norm2 += (k < 3 ? 1.0 : 2.0) * D[k] * D[k];
+// b + b (exp(A) - 1) with A = -t D, which commutes with b: the series to A^5, by the invariants J2
+// = -I2 and J3 = I3 of t D.
+#define MPM_SHORT_REACH 6e-3 // of A's norm: the next term is 2e-17 at most
+MPM_KERNEL void mpm_exp_twice_less(const mpm_vec *b, const mpm_vec *D, mpm_vec norm2, mpm_vec part,
+                                   mpm_vec mean, mpm_vec *less, const int dim) {
+    const mpm_vec half = 0.5 * norm2, t = 2.0 * part, t2 = t * t, J2 = t2 * half;
+    const mpm_vec minor = D[2] * D[2] - half; // of the plane's components, in 2D
+    const mpm_vec J3 = t2 * (t * (dim == 2 ? D[2] * minor : mpm_det_sym(D, dim)));
+    const mpm_vec p0 = -J3 * (1.0 / 6 + J2 * (1.0 / 120));
+    const mpm_vec p1 = -t * (1.0 - J3 * (1.0 / 24) + J2 * (1.0 / 6 + J2 * (1.0 / 120)));
+    const mpm_vec p2 = t2 * (0.5 + J2 * (1.0 / 24) - J3 * (1.0 / 120));
+    mpm_vec E[6], bE[6];
+    if (dim == 2) { // in the plane D^2 = -D[2] D - minor 1 (Cayley, Hamilton, and no trace)
+        const mpm_vec q0 = p0 - p2 * minor, q1 = p1 - p2 * D[2];
+        E[0] = q0 + q1 * D[0];
+        E[1] = q0 + q1 * D[1];
+        E[2] = p0 + D[2] * (p1 + p2 * D[2]);
+        E[3] = q1 * D[3];
+    } else {
+        mpm_vec D2[6];
+        mpm_commuting_product(D, D, D2, dim);
+        for (int k = 0; k < MPM_SYM(dim); k++) {
+            E[k] = (k < 3 ? p0 + p1 * D[k] : p1 * D[k]) + p2 * D2[k];
+        }
     }
-    const mpm_vec half_norm2 = 0.5 * norm2, det = mpm_det_sym(D, dim);
-    const mpm_vec s = -2.0 * part, s2 = s * s;
-    const mpm_vec J2 = s2 * half_norm2, J3 = s2 * (s * det), J22 = J2 * J2, J23 = J2 * J3;
-    const mpm_vec J33 = J3 * J3;
-    const mpm_vec p0 =
-        1.0 + (J3 * (1.0 / 6) + J23 * (1.0 / 120)) + (J33 * (1.0 / 720) + J22 * J3 * (1.0 / 5040));
-    const mpm_vec p1 = (1.0 + J2 * (1.0 / 6) + J3 * (1.0 / 24)) +
-                       (J22 * (1.0 / 120) + J23 * (1.0 / 360)) + (J33 + J22 * J2) * (1.0 / 5040);
-    const mpm_vec p2 =
-        (0.5 + J2 * (1.0 / 24) + J3 * (1.0 / 120)) + (J22 * (1.0 / 720) + J23 * (1.0 / 2520));
-    const mpm_vec p1_s = p1 * s, p2_s2 = p2 * s2;
+    mpm_commuting_product(b, E, bE, dim);
     for (int k = 0; k < MPM_SYM(dim); k++) {
-        less[k] = p0 * b[k] + (p1_s * bD[k] + p2_s2 * bD2[k]);
+        less[k] = b[k] + bE[k];
     }
-    const mpm_mask near = s2 * norm2 <= MPM_SHORT_REACH * MPM_SHORT_REACH;
+    const mpm_mask near = J2 <= 0.5 * MPM_SHORT_REACH * MPM_SHORT_REACH;
     if (MPM_UNLIKELY(!mpm_all(near))) {
         mpm_vec e[6], far[6];
         for (int k = 0; k < MPM_SYM(dim); k++) {

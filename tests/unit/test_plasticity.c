@@ -11,6 +11,7 @@
 
 #include <cmocka.h>
 
+#include "server/mpm/laws.h"
 #include "server/mpm/sim.h"
 #include "server/mpm/spectral.h"
 
@@ -213,6 +214,32 @@ static void test_plasticity_return_solves_its_equation(void **state) {
             // eps of b is eps/2 of the strain; softening amplifies by 1/(1 - RATE fall/3 mu).
             assert_near(s.plastic_strain[0] - a, sqrt(2.0 / 3) * x, 2e-15 * (1 + norm / MU));
             mpm_particles_free(&s);
+        }
+    }
+}
+
+// The return alone on both sides of its reaches, against its equation in long double, d = d0 - q
+// h(d). Within them nothing but roundings, beyond them what its iterates stop at.
+static void test_plasticity_return_within_its_reaches(void **state) {
+    (void)state;
+    static const double parts[] = {1e-6, 1e-3, 0.1, 0.5, 1 - 1e-12, 1 + 1e-12, 2, 30, 1e4};
+    for (double q = 1e-8; q < 50; q *= 1.7) {
+        for (size_t k = 0; k < sizeof parts / sizeof *parts; k++) {
+            const double d0 = parts[k] * fmin(HENCKY_J2_REACH, HENCKY_J2_SLOPE / q), a = 0.02;
+            struct hencky_j2 c = {
+                .residual = 1e-4, .softening = RATE, .rate = sqrt(2.0 / 3) * RATE};
+            const double soft = q / (1 + q) / c.rate, x0 = d0 / c.rate;
+            c.fall = soft * exp(RATE * a);
+            const double norm = c.residual + soft + x0 / (1 + q);
+            const double x = hencky_j2_return(&c, norm * norm, x0, q, a);
+            long double d = d0;
+            for (int i = 0; i < 60; i++) { // from above: h is convex
+                const long double e = expm1l(-d);
+                d -= (d - d0 + q * (e + d)) / (1 - q * e);
+            }
+            const bool far = d0 > HENCKY_J2_REACH || q * d0 > HENCKY_J2_SLOPE;
+            const double tol = 2 * DBL_EPSILON * x0 + (far ? 4 * DBL_EPSILON * norm * (1 + q) : 0);
+            assert_near(x, (double)(d / c.rate), tol);
         }
     }
 }
@@ -825,6 +852,7 @@ int main(int argc, char **argv) {
         cmocka_unit_test(test_plasticity_meets_the_strength),
         cmocka_unit_test(test_plasticity_returned_state_is_at_rest),
         cmocka_unit_test(test_plasticity_return_solves_its_equation),
+        cmocka_unit_test(test_plasticity_return_within_its_reaches),
         cmocka_unit_test(test_plasticity_uniaxial_strain),
         cmocka_unit_test(test_plasticity_uniaxial_stress_is_the_strength),
         cmocka_unit_test(test_plasticity_simple_shear),

@@ -429,6 +429,53 @@ static void test_spectral_exp_of_pure_shear(void **state) {
     }
 }
 
+// b of a strain whose deviator shrinks by a part, on both sides of the series' reach, against the
+// eigenvalues in long double. Rounded are b, what is added and the sum; beyond the reach as
+// mpm_exp_twice is.
+static void test_spectral_exp_of_less(void **state) {
+    (void)state;
+    static const double norms[] = {1e-9, 1e-5, 1e-3, 5e-3, 1 - 1e-12, 1 + 1e-12, 0.02, 0.5};
+    FOR_ROTATED(dim, trial) {
+        const double mean = 0.1 * uniform();
+        for (size_t n = 0; n < sizeof norms / sizeof *norms; n++) {
+            const double A = fabs(norms[n] - 1) < 1e-9 ? norms[n] * MPM_SHORT_REACH : norms[n];
+            const double part = trial % 3 ? fmax(0.5 * A, 0.5 * (1 + uniform())) : 1; // |D| <= 1
+            double w[3], Q[9], D[6], b[6], less[6];
+            long double wide[6] = {0}, exact[6] = {0};
+            const double shift[3] = {uniform(), uniform(), uniform()};
+            for (int d = 0; d < 3; d++) {
+                w[d] = shift[d] - (shift[0] + shift[1] + shift[2]) / 3;
+            }
+            rotation(Q, dim);
+            compose(w, Q, D, dim);
+            const double scale = A / (2 * part) / norm_of(D, dim);
+            for (int d = 0; d < 3; d++) {
+                w[d] *= scale;
+            }
+            for (int k = 0; k < MPM_SYM(dim); k++) {
+                D[k] *= scale;
+                for (int d = 0; d < 3; d++) {
+                    const long double q2 =
+                        (long double)Q[3 * mpm_sym_row(k) + d] * Q[3 * mpm_sym_column(k) + d];
+                    wide[k] += q2 * expl(2 * (mean + (long double)w[d]));
+                    exact[k] += q2 * expl(2 * (mean + (1 - (long double)part) * w[d]));
+                }
+                b[k] = (double)wide[k];
+            }
+            const double norm = norm_of(D, dim);
+            if (dim == 2) {
+                mpm_exp_twice_less(b, D, norm * norm, part, mean, less, 2);
+            } else {
+                mpm_exp_twice_less(b, D, norm * norm, part, mean, less, 3);
+            }
+            const double ulps = A <= MPM_SHORT_REACH ? 1 + 4 * A : 8;
+            for (int k = 0; k < MPM_SYM(dim); k++) {
+                assert_near(less[k], (double)exact[k], ulps * DBL_EPSILON * size_of(b, dim));
+            }
+        }
+    }
+}
+
 int main(int argc, char **argv) {
     feenableexcept(FE_DIVBYZERO | FE_INVALID | FE_OVERFLOW);
     const struct CMUnitTest tests[] = {
@@ -443,6 +490,7 @@ int main(int argc, char **argv) {
         cmocka_unit_test(test_spectral_is_continuous_at_its_switches),
         cmocka_unit_test(test_spectral_log_is_linear_near_the_identity),
         cmocka_unit_test(test_spectral_exp_of_pure_shear),
+        cmocka_unit_test(test_spectral_exp_of_less),
     };
     cmocka_set_test_filter(argc > 1 ? argv[1] : NULL);
     return cmocka_run_group_tests(tests, NULL, NULL);

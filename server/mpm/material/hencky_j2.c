@@ -8,86 +8,70 @@
 #include "server/mpm/spectral.h"
 
 struct hencky_j2 {
-    double two_mu, K;  // Pa
-    double per_two_mu; // 1/Pa
-    double residual;   // Pa, sqrt(2/3) of the residual strength
-    double fall;       // Pa, sqrt(2/3) of the peak's excess over it
-    double softening;  // 1
-    double rate;       // 1, sqrt(2/3) softening: d soft/dx = -rate soft
-    double per_rate;   // 1, its inverse, 0 without softening
+    double two_mu, K; // Pa
+    // Strengths as the |dev eps| that they allow, sqrt(2/3) sigma_y/(2 mu).
+    double residual;  // 1
+    double fall;      // 1, the peak's excess over it
+    double softening; // 1
+    double rate;      // 1, sqrt(2/3) softening: d soft/dx = -rate soft
 };
 
 #define HENCKY_J2_ROOT 0.81649658092772603 // sqrt(2/3)
 
-// sqrt(2/3) (sigma_y(a) - residual)
+// What the strength at a exceeds the residual one by, as |dev eps|.
 MPM_KERNEL mpm_vec hencky_j2_soft(const struct hencky_j2 *c, mpm_vec a) {
     return c->fall > 0 ? c->fall * mpm_exp(-c->softening * a) : mpm_splat(0);
 }
 
-// The radial return from |dev tau| = norm, where `yields`: the new plastic strain a, and soft at
-// it. g(x) = norm - 2 mu x - residual - soft(a + sqrt(2/3) x), with x = |d eps_p|, is concave and
-// falling, so Newton's iterates come down to the root from above after the first.
-MPM_KERNEL mpm_vec hencky_j2_far_return(const struct hencky_j2 *c, mpm_vec norm, mpm_mask going,
-                                        mpm_vec a, mpm_vec *soft) {
-    const double rate = c->rate;
-    mpm_vec x = mpm_splat(0);
-    for (int k = 0; k < 50; k++) { // quadratic: 2 or 3 in practice
-        const mpm_vec g = norm - c->two_mu * x - c->residual - *soft;
-        const mpm_vec step = g / (c->two_mu - rate * *soft), d = rate * step;
-        // What a short step leaves of g is its second order, soft d^2/2.
-        const mpm_mask done = (*soft * d * d <= DBL_EPSILON * norm) & (d * d < 0.01);
+// The radial return from |dev eps| = norm where `going`, a being that before: x = |d eps_p|, by
+// Newton's method from a given x in [0, norm]. g(x) = norm - x - residual - soft(a + sqrt(2/3) x)
+// is concave and falling, so the iterates come down to the root from above after the first.
+MPM_KERNEL mpm_vec hencky_j2_far_return(const struct hencky_j2 *c, mpm_vec norm, mpm_vec x,
+                                        mpm_mask going, mpm_vec a) {
+    for (int k = 0; k < 50; k++) { // quadratic: 1 to 3 in practice
+        const mpm_vec soft = hencky_j2_soft(c, a + HENCKY_J2_ROOT * x);
+        const mpm_vec step = (norm - x - c->residual - soft) / (1.0 - c->rate * soft);
+        const mpm_vec d = c->rate * step;
         x = mpm_select(going, x + step, x);
-        *soft = mpm_select(going, *soft * (1.0 - d + 0.5 * d * d), *soft);
-        going &= mpm_not(done);
+        // What a short step leaves of g is its second order, soft d^2/2.
+        going &= mpm_not((soft * d * d <= DBL_EPSILON * norm) & (d * d < 0.01));
         if (!mpm_any(going)) {
             break;
         }
-        *soft = mpm_select(going, hencky_j2_soft(c, a + HENCKY_J2_ROOT * x), *soft);
     }
     return x;
 }
 
-// A step's strain is mostly so small that soft needs no exponential: soft(a + sqrt(2/3) x) =
-// soft(a) (1 - d + h) with d = rate x and h(d) = exp(-d) - 1 + d, its series to d^7. So d = d0 - q
-// h(d) with q = rate soft / (2 mu - rate soft), which two steps of Newton's method from d0 solve:
-// d exceeds the solution by a part of q d/2, (q d/2)^3 and (q d)^5 or less of itself.
-#define HENCKY_J2_REACH 0.02 // of d: the series' next term is 6e-19
-#define HENCKY_J2_SLOPE 1e-3 // of q d
-MPM_KERNEL void hencky_j2_return(const struct hencky_j2 *c, mpm_vec norm, mpm_vec compliance,
-                                 mpm_mask yields, mpm_vec *a, mpm_vec *soft) {
+// The same from x0, what would flow if soft fell linearly from a on. A step's strain is mostly so
+// small that it needs no exponential: soft(a + sqrt(2/3) x) = soft(a) (1 - d + h) with d = rate x
+// and h(d) = exp(-d) - 1 + d, here its series to d^5. With q = rate soft/(1 - rate soft), d0 = rate
+// x0 and h, h', h'' at d0, d = d0 - q h(d) = d0 - q h + q^2 h h' - q^3 (h h'^2 + h^2 h''/2) + ...
+// (Lagrange): d0 - q h (1 - s + 5/4 s^2) with s = q h', since h h'' is h'^2/2 but for a third of
+// d0.
+#define HENCKY_J2_REACH 6e-3 // of d0: the next term of h is 1e-16 of d, q d0 being within
+#define HENCKY_J2_SLOPE 5e-5 // of q d0: the next term of d is 7/8 (q d0)^4 = 5e-18 of it
+MPM_KERNEL mpm_vec hencky_j2_return(const struct hencky_j2 *c, mpm_vec norm2, mpm_vec x0, mpm_vec q,
+                                    mpm_vec a) {
     if (!(c->softening > 0)) {
-        *a = mpm_select(yields, *a + HENCKY_J2_ROOT / c->two_mu * (norm - c->residual - *soft), *a);
-        return;
+        return x0;
     }
-    const mpm_vec r = c->rate * compliance, q = *soft * r;
-    const mpm_vec above = (norm - c->residual - *soft) * r;
-    const mpm_vec d0 = mpm_min(mpm_max(above, mpm_splat(0)), mpm_splat(HENCKY_J2_REACH));
-    const mpm_vec d2 = d0 * d0;
-    const mpm_vec h0 = d2 * ((0.5 - d0 * (1.0 / 6)) + d2 * ((1.0 / 24 - d0 * (1.0 / 120)) +
-                                                            d2 * (1.0 / 720 - d0 * (1.0 / 5040))));
-    const mpm_vec slope = d0 - h0, curve = 0.5 - 0.5 * slope; // h' and h''/2, here 1/2 exp(-d)
-    const mpm_vec s = q * slope, per_slope = 1.0 - s + s * s; // 1/(1 + s)
-    const mpm_vec one = -(q * h0) * per_slope;
-    const mpm_vec h1 = h0 + one * (slope + one * (curve - one * curve * (1.0 / 3)));
-    const mpm_vec two = -(one + q * h1) * per_slope;
-    const mpm_vec d = d0 + (one + two), h = h1 + two * slope;
-    mpm_vec x = d * c->per_rate, soft_now = *soft * (1.0 - d + h);
-    const mpm_mask far =
-        yields & mpm_not((above <= HENCKY_J2_REACH) & (q * above <= HENCKY_J2_SLOPE));
+    const mpm_vec d = c->rate * x0, qd = q * d;
+    const mpm_vec qh = qd * (0.5 + d * (-1.0 / 6 + d * (1.0 / 24 - d * (1.0 / 120)))); // over d
+    const mpm_vec s = qd - qh * d;
+    mpm_vec x = x0 - x0 * (qh * (1.0 - s * (1.0 - 1.25 * s)));
+    const mpm_mask far = mpm_max(qd, d * (HENCKY_J2_SLOPE / HENCKY_J2_REACH)) > HENCKY_J2_SLOPE;
     if (MPM_UNLIKELY(mpm_any(far))) {
-        mpm_vec soft_far = *soft;
-        x = mpm_select(far, hencky_j2_far_return(c, norm, far, *a, &soft_far), x);
-        soft_now = mpm_select(far, soft_far, soft_now);
+        const mpm_vec start = mpm_min(mpm_max(x, mpm_splat(0)), x0);
+        x = mpm_select(far, hencky_j2_far_return(c, mpm_sqrt(norm2), start, far, a), x);
     }
-    *soft = mpm_select(yields, soft_now, *soft);
-    *a = mpm_select(yields, *a + HENCKY_J2_ROOT * x, *a);
+    return x;
 }
 
 MPM_KERNEL void hencky_j2_stress(const struct hencky_j2 *c, const int n, mpm_vec (*b)[6],
                                  mpm_vec *a, mpm_vec (*sigma)[6], const int dim) {
     mpm_vec dev[MPM_VECTORS][6], trace[MPM_VECTORS], norm2[MPM_VECTORS], soft[MPM_VECTORS];
-    mpm_vec back[MPM_VECTORS];
-    mpm_mask yields[MPM_VECTORS];
+    mpm_vec x0[MPM_VECTORS], q[MPM_VECTORS], per_norm[MPM_VECTORS];
+    mpm_vec part[MPM_VECTORS];               // of the deviator, that flows away
     int flowing[MPM_VECTORS], n_flowing = 0; // the vectors in which something flows
     for (int v = 0; v < n; v++) {
         mpm_vec e[6], sum = mpm_splat(0);
@@ -99,34 +83,39 @@ MPM_KERNEL void hencky_j2_stress(const struct hencky_j2 *c, const int n, mpm_vec
         }
         norm2[v] = sum;
         soft[v] = hencky_j2_soft(c, a[v]);
-        const mpm_vec radius = (c->residual + soft[v]) * c->per_two_mu; // as |dev eps|
+        part[v] = mpm_splat(0);
+        const mpm_vec radius = c->residual + soft[v];
         flowing[n_flowing] = v;
-        n_flowing += mpm_any(sum > radius * radius); // the same as `yields` but for round-off
+        n_flowing += mpm_any(sum > radius * radius);
     }
     for (int k = 0; k < n_flowing; k++) {
         const int v = flowing[k];
-        const mpm_vec norm = c->two_mu * mpm_sqrt(norm2[v]), limit = c->residual + soft[v];
-        const mpm_vec most = mpm_max(norm, limit), stiffness = c->two_mu - c->rate * soft[v];
-        const mpm_vec inverse = 1.0 / (most * stiffness); // of both: a division takes its time
-        yields[v] = norm > limit;
-        hencky_j2_return(c, norm, inverse * most, yields[v], &a[v], &soft[v]);
-        back[v] =
-            mpm_select(yields[v], (c->residual + soft[v]) * (inverse * stiffness), mpm_splat(1));
+        const mpm_vec radius = c->residual + soft[v];
+        // Where nothing flows, most = radius: x0 and all that comes of it is 0, b and a keep their
+        // bits.
+        const mpm_vec most = mpm_max(mpm_sqrt(norm2[v]), radius);
+        const mpm_vec slope = c->rate * soft[v], net = 1.0 - slope;
+        const mpm_vec inverse = 1.0 / (most * net); // of both: a division takes its time
+        const mpm_vec per_net = inverse * most;
+        x0[v] = (most - radius) * per_net;
+        q[v] = slope * per_net;
+        per_norm[v] = inverse * net;
     }
     for (int k = 0; k < n_flowing; k++) {
         const int v = flowing[k];
-        mpm_vec flowed[6];
-        mpm_exp_twice_less(b[v], dev[v], 1.0 - back[v], trace[v] * (1.0 / 3), flowed, dim);
-        for (int i = 0; i < MPM_SYM(dim); i++) {
-            dev[v][i] *= back[v];
-            b[v][i] = mpm_select(yields[v], flowed[i], b[v][i]);
-        }
+        const mpm_vec x = hencky_j2_return(c, norm2[v], x0[v], q[v], a[v]);
+        a[v] += HENCKY_J2_ROOT * x;
+        part[v] = x * per_norm[v];
+    }
+    for (int k = 0; k < n_flowing; k++) {
+        const int v = flowing[k];
+        mpm_exp_twice_less(b[v], dev[v], norm2[v], part[v], trace[v] * (1.0 / 3), b[v], dim);
     }
     for (int v = 0; v < n; v++) {
         const mpm_vec r = mpm_exp(-trace[v]), pressure_part = c->K * trace[v];
+        const mpm_vec two_mu = c->two_mu - c->two_mu * part[v];
         for (int k = 0; k < MPM_SYM(dim); k++) {
-            sigma[v][k] =
-                r * (k < 3 ? c->two_mu * dev[v][k] + pressure_part : c->two_mu * dev[v][k]);
+            sigma[v][k] = r * (k < 3 ? two_mu * dev[v][k] + pressure_part : two_mu * dev[v][k]);
         }
     }
 }
@@ -196,13 +185,11 @@ static int conflict(const double *par, const char **why) {
 static void prepare(const double *par, void *constants) {
     struct hencky_j2 *c = constants;
     c->two_mu = 2 * shear_modulus(par);
-    c->per_two_mu = 1 / c->two_mu;
     c->K = bulk_modulus(par);
-    c->residual = sqrt(2.0 / 3) * residual_strength(par);
-    c->fall = sqrt(2.0 / 3) * (par[YIELD_STRENGTH] - residual_strength(par));
+    c->residual = HENCKY_J2_ROOT * residual_strength(par) / c->two_mu;
+    c->fall = HENCKY_J2_ROOT * (par[YIELD_STRENGTH] - residual_strength(par)) / c->two_mu;
     c->softening = c->fall > 0 ? par[SOFTENING] : 0;
     c->rate = HENCKY_J2_ROOT * c->softening;
-    c->per_rate = c->softening > 0 ? 1 / c->rate : 0;
 }
 MPM_SPANS_KEEPS_B(hencky_j2)
 
