@@ -8,7 +8,7 @@
 
 #include "server/mpm/basis.h"
 
-#define FAR_GRID ((size_t)2 << 20) // bytes: a core's own cache has room for less
+#define FAR_GRID ((size_t)4 << 20) // bytes: what a core has of its caches holds less
 
 bool mpm_grid_is_far(const struct mpm_grid *g) {
     const size_t width = MPM_NODE + (size_t)MPM_VELOCITY(g->dim);

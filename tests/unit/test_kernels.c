@@ -229,7 +229,7 @@ static void test_kernels_give_the_same_bits_of_many_nodes_on_any_number_of_threa
     static const int schemes[] = {MPM_FBAR_OFF, MPM_FBAR_ANCHORED};
     for (int dim = 2; dim <= 3; dim++) {
         for (size_t k = 0; k < sizeof schemes / sizeof *schemes; k++) {
-            define(dim, MPM_GIMP, schemes[k], CLAY, dim == 2 ? 180 : 30, 1);
+            define(dim, MPM_GIMP, schemes[k], CLAY, dim == 2 ? 230 : 38, 1);
             struct mpm_sim *one = create(MPM_ISA_BASELINE, 1, 8);
             assert_true(mpm_grid_is_far(&one->grid));
             advance(one, 3);
