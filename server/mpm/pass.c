@@ -23,6 +23,8 @@ static uint32_t *parts_of(const struct mpm_sim *sim, size_t body) {
     return sim->parts + body * ((size_t)sim->def->n_threads + 1);
 }
 
+#define SHARE_STEPS 64 // after which work is shared out anew without a sort
+
 // What threads get through in a second differs: with what flows in their parts, and with what else
 // wants their cores. So each one's share follows what it did with the last; nothing that is
 // computed depends on the shares.
@@ -48,7 +50,7 @@ static void follow_speeds(struct mpm_sim *sim, int n) {
 
 void mpm_share_out(struct mpm_sim *sim) {
     const int n = sim->team->n_there;
-    if (sim->n_shared == n) {
+    if (sim->n_shared == n && (n == 1 || ++sim->steps_shared < SHARE_STEPS)) {
         return;
     }
     follow_speeds(sim, n);
@@ -76,6 +78,7 @@ void mpm_share_out(struct mpm_sim *sim) {
     sim->cut[n] = sim->grid.n_slots;
     sim->walls_in_common = mpm_walls_share(sim->walls, sim->n_walls, &sim->grid, sim->cut, n);
     sim->n_shared = n;
+    sim->steps_shared = 0;
 }
 
 // All but the sums, which are not the same in any order.
@@ -258,7 +261,7 @@ static void nodes_ahead(const struct part_work *w, uint32_t t, uint32_t next, in
 
 // Waits until those are done that come before a stretch of the part [begin, end), and are not
 // surely done by who comes to it. Adds the seconds that it takes to *since.
-static void await_before(const struct part_work *w, uint32_t t, size_t begin, size_t end,
+static void await_before(const struct part_work *w, int own, uint32_t t, size_t begin, size_t end,
                          double *since) {
     const struct mpm_order *order = w->order;
     const bool few = end - begin < MPM_FEW; // all by one thread, one after the other
@@ -274,7 +277,7 @@ static void await_before(const struct part_work *w, uint32_t t, size_t begin, si
         for (unsigned pass;
              (pass = atomic_load_explicit(done, memory_order_acquire)) != w->adding;) {
             const double waits = mpm_now_or_zero(w->sim);
-            mpm_team_await(w->sim->team, done, pass);
+            mpm_team_await(w->sim->team, own, done, pass);
             *since += mpm_now_or_zero(w->sim) - waits;
         }
     }
@@ -312,7 +315,7 @@ static void work_on_stretches(const struct part_work *w, int own, int there) {
             const uint32_t t = order->share[i], next = order->share[i + 1 < end ? i + 1 : i];
             const struct mpm_stretch *stretch = &order->stretch[t];
             if (there > 1) {
-                await_before(w, t, begin, end, &since);
+                await_before(w, own, t, begin, end, &since);
             }
             if (next != t && (w->grid_is_far || order->ties[next])) {
                 nodes_ahead(w, t, next, own);

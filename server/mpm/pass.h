@@ -24,8 +24,8 @@ struct mpm_pass {
     bool adds;     // to the grid
 };
 
-// After a sort, and for another number of threads: shares particles, nodes and walls out among the
-// threads of the team, by their speeds since the last time.
+// After a sort, for another number of threads, and now and then: shares particles, nodes and walls
+// out among the threads of the team, by their speeds since the last time.
 void mpm_share_out(struct mpm_sim *sim);
 // Thread `own` of `there`: its share of a pass over a body; one body comes after the other. What is
 // found stays with the threads until the step is over.

@@ -53,7 +53,8 @@ struct mpm_turn {
     _Alignas(64) struct mpm_span_result found; // in this step, but for sums
     int fault_pass;                            // if it found a fault: in which pass
     size_t fault_body;                         // and whose particle's
-    // Since the last sort: at work, without waiting, s, and on how many particles, pass by pass.
+    // Since work was shared out: at work, without waiting, s, and on how many particles, pass by
+    // pass.
     double seconds, work;
     double speed, share; // particles a second before that, and its share of all work
 };
@@ -80,8 +81,9 @@ struct mpm_sim {
     struct mpm_sorter sorter;
     struct mpm_turn *turns; // (n_threads)
     uint32_t *parts;        // (n_sets, n_threads + 1) first chunk of each thread's part of a body
-    uint32_t *cut; // (n_threads + 1) thread k has the nodes of the slots [cut[k], cut[k + 1])
-    int n_shared;  // threads to which nodes and walls are shared out; 0 after a sort
+    uint32_t *cut;    // (n_threads + 1) thread k has the nodes of the slots [cut[k], cut[k + 1])
+    int n_shared;     // threads to which nodes and walls are shared out; 0 after a sort
+    int steps_shared; // since then
     bool walls_in_common;
     struct mpm_wall *walls;
     struct mpm_load *loads;

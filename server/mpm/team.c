@@ -1,6 +1,6 @@
-// Threads that stand by for a step: they look at a word of memory for some ten microseconds, as
-// long as a wake-up takes, and then wait for it in the kernel, so that threads that outnumber the
-// cores give way to each other.
+// Threads that stand by for a step: they look at a word of memory for a while, and then wait for it
+// in the kernel, so that threads that outnumber the cores give way to each other. How long they
+// look follows what came of it.
 #include "server/mpm/team.h"
 
 #include <limits.h>
@@ -19,7 +19,15 @@
 
 #include "server/mpm/simd.h"
 
-#define LOOKS 1000
+// How often a thread looks at a word, some 17 ns each time, before it sleeps. To be woken takes as
+// long as many looks; so it goes on while that mostly spares the sleep. Where threads outnumber the
+// cores it does not: then looks take time from who is waited for.
+#define MANY_LOOKS 4000
+#define FEW_LOOKS 100
+// Waits that outlast the few, after which it decides: half of them may outlast the many, too. After
+// so many sleeps it tries again.
+#define WAITS_OF_MANY 16
+#define WAITS_OF_FEW 256
 
 // Who goes to sleep says so and then looks at the word again; who changes the word then looks
 // whether anyone sleeps. One of them sees the other only if neither's store waits behind its look.
@@ -37,13 +45,27 @@ static void fence_all(const struct mpm_team *team) {
 #endif
 }
 
-void mpm_team_await(struct mpm_team *team, atomic_uint *word, unsigned old) {
-    for (int k = 0; k < LOOKS; k++) {
+static void learn(struct mpm_seat *seat, bool slept) {
+    const bool many = seat->looks == MANY_LOOKS;
+    seat->slept += slept;
+    if (++seat->waits == (many ? WAITS_OF_MANY : WAITS_OF_FEW)) {
+        seat->looks = many && seat->slept > WAITS_OF_MANY / 2 ? FEW_LOOKS : MANY_LOOKS;
+        seat->waits = seat->slept = 0;
+    }
+}
+
+void mpm_team_await(struct mpm_team *team, int own, atomic_uint *word, unsigned old) {
+    struct mpm_seat *seat = &team->seats[own];
+    for (int k = 0; k < seat->looks; k++) {
         if (atomic_load_explicit(word, memory_order_acquire) != old) {
+            if (k >= FEW_LOOKS) {
+                learn(seat, false);
+            }
             return;
         }
         mpm_pause();
     }
+    learn(seat, true);
     atomic_fetch_add(&team->asleep, 1);
     fence_all(team);
     while (atomic_load(word) == old) {
@@ -82,6 +104,9 @@ struct mpm_team *mpm_team_create(int n_threads) {
         return NULL;
     }
     *team = (struct mpm_team){.n_threads = n_threads, .n_there = 1, .seats = seat};
+    for (int k = 0; k < n_threads; k++) {
+        seat[k] = (struct mpm_seat){.looks = MANY_LOOKS};
+    }
 #ifdef __linux__
     team->fences =
         n_threads > 1 && syscall(SYS_membarrier, MEMBARRIER_CMD_REGISTER_PRIVATE_EXPEDITED, 0, 0);
@@ -106,11 +131,11 @@ static unsigned come(struct mpm_team *team, int own) {
 }
 
 // Waits until a thread has come to a barrier; it may be past it.
-static void await_at(struct mpm_team *team, int other, unsigned barrier) {
+static void await_at(struct mpm_team *team, int own, int other, unsigned barrier) {
     atomic_uint *met = &team->seats[other].met;
     for (unsigned now;
          (int)((now = atomic_load_explicit(met, memory_order_acquire)) - barrier) < 0;) {
-        mpm_team_await(team, met, now);
+        mpm_team_await(team, own, met, now);
     }
 }
 
@@ -123,7 +148,7 @@ void mpm_team_barrier(struct mpm_team *team, int own, int there) {
     const unsigned barrier = come(team, own);
     for (int k = 0; k < there; k++) {
         if (k != own) {
-            await_at(team, k, barrier);
+            await_at(team, own, k, barrier);
         }
     }
 }
@@ -136,7 +161,7 @@ static void next_round(struct mpm_team *team) {
 
 static void serve(struct mpm_team *team, unsigned round, int own, int there) {
     for (;;) {
-        mpm_team_await(team, &team->round, round++);
+        mpm_team_await(team, own, &team->round, round++);
         if (team->over) {
             return;
         }
@@ -183,7 +208,7 @@ void mpm_team_run(struct mpm_team *team, mpm_team_work *work, void *context) {
         work(context, 0, there);
         const unsigned end = come(team, 0);
         for (int k = 1; k < there; k++) {
-            await_at(team, k, end);
+            await_at(team, 0, k, end);
         }
         return;
     }

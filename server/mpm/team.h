@@ -15,6 +15,8 @@ typedef void mpm_team_work(void *context, int own, int there);
 // in one: to fetch a line that another core has changed takes longer than all else of a meeting.
 struct mpm_seat {
     _Alignas(64) atomic_uint met; // barriers and ends of rounds that the thread has come to
+    // For itself: how often it looks before it sleeps, and what came of that in so many waits.
+    _Alignas(64) int looks, waits, slept;
 };
 
 #define MPM_GIVEN 5 // numbers; they fill up the line that says that there is work
@@ -42,7 +44,7 @@ void mpm_team_hold(struct mpm_team *team, void (*body)(void *context), void *con
 void mpm_team_run(struct mpm_team *team, mpm_team_work *work, void *context);
 // Within such work: waits until all `there` have come here.
 void mpm_team_barrier(struct mpm_team *team, int own, int there);
-// Within such work: waits until the word is not `old`. Who changes it stores with release order,
-// and then tells the team.
-void mpm_team_await(struct mpm_team *team, atomic_uint *word, unsigned old);
+// Within such work: thread `own` waits until the word is not `old`. Who changes it stores with
+// release order, and then tells the team.
+void mpm_team_await(struct mpm_team *team, int own, atomic_uint *word, unsigned old);
 void mpm_team_tell(struct mpm_team *team, atomic_uint *word);

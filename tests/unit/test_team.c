@@ -6,6 +6,7 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <time.h>
 
 #include <cmocka.h>
 
@@ -58,7 +59,7 @@ static void test_team_does_each_part_once(void **state) {
     (void)state;
     for (int n = 1; n <= MOST; n += 3) {
         struct mpm_team *team = mpm_team_create(n);
-    assert_non_null(team);
+        assert_non_null(team);
         for (int held = 0; held < 2; held++) {
             struct count c = {.team = team};
             if (held) {
@@ -94,6 +95,38 @@ static void test_team_can_be_held_again(void **state) {
     mpm_team_free(team);
 }
 
+static void come_late(void *context, int own, int there) {
+    struct mpm_team *team = context;
+    if (own == there - 1) {
+        const struct timespec a_while = {.tv_nsec = 200000};
+        nanosleep(&a_while, NULL);
+    }
+    mpm_team_barrier(team, own, there);
+}
+
+static void wait_for_late_ones(void *context) {
+    struct mpm_team *team = context;
+    const int *looks = &team->seats[0].looks, many = *looks;
+    int k = 0;
+    for (; k < 10 * ROUNDS && team->n_there > 1 && *looks == many; k++) {
+        mpm_team_run(team, come_late, team);
+    }
+    assert_true(*looks < many || team->n_there == 1);
+    for (; k < 20 * ROUNDS && *looks < many; k++) {
+        mpm_team_run(team, come_late, team);
+    }
+    assert_int_equal(*looks, many);
+}
+
+// Who waits in vain looks less often before it sleeps, and later tries again.
+static void test_team_learns_how_long_to_look(void **state) {
+    (void)state;
+    struct mpm_team *team = mpm_team_create(2);
+    assert_non_null(team);
+    mpm_team_hold(team, wait_for_late_ones, team);
+    mpm_team_free(team);
+}
+
 static void race(void *context, int own, int there) {
     (void)own, (void)there;
     ++*(int *)context;
@@ -120,6 +153,7 @@ int main(int argc, char **argv) {
     const struct CMUnitTest tests[] = {
         cmocka_unit_test(test_team_does_each_part_once),
         cmocka_unit_test(test_team_can_be_held_again),
+        cmocka_unit_test(test_team_learns_how_long_to_look),
     };
     cmocka_set_test_filter(argc > 1 ? argv[1] : NULL);
     return cmocka_run_group_tests(tests, NULL, NULL);
