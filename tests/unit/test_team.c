@@ -98,7 +98,7 @@ static void test_team_can_be_held_again(void **state) {
 static void come_late(void *context, int own, int there) {
     struct mpm_team *team = context;
     if (own == there - 1) {
-        const struct timespec a_while = {.tv_nsec = 200000};
+        const struct timespec a_while = {.tv_nsec = 1000000}; // many looks take a fifth of it
         nanosleep(&a_while, NULL);
     }
     mpm_team_barrier(team, own, there);
