@@ -293,41 +293,36 @@ static void say_done(const struct part_work *w, uint32_t t, size_t begin, size_t
     }
 }
 
+// A thread on its way through the parts.
+struct walk {
+    int own, there;
+    size_t begin, end; // of the part that it is in: stretches, or chunks
+    struct mpm_span_result found;
+    double since; // s, when it began, and what it has waited since
+};
+
 // Work that adds to the grid goes by stretches. One waits for those near it that come before it, so
 // that every node's sum has one order whatever the number of threads (order.h). Each thread does
 // its own part first, then what others are far from. Nobody waits for one that nobody will do: the
 // parts' orders are those of one order of all stretches (stretch.c), so that of those that are not
 // done the first waits for none, and is always taken by the one whose part it is, if not before.
-static void work_on_stretches(const struct part_work *w, int own, int there) {
+// Returns how many particles that were.
+static size_t work_on_stretch(const struct part_work *w, struct walk *walk, size_t i) {
     const struct mpm_order *order = w->order;
-    struct mpm_span_result found = mpm_nothing_found();
-    double since = there > 1 ? mpm_now_or_zero(w->sim) : 0;
-    size_t work = 0;
-    for (int k = 0; k < w->n_parts; k++) {
-        const int part = (own + k) % w->n_parts;
-        struct mpm_turn *turn = &w->sim->turns[part];
-        const size_t begin = order->chunk[w->parts[part]], end = order->chunk[w->parts[part + 1]];
-        if (k == 0 && end - begin >= MPM_FEW) {
-            begin_turn(turn, begin, end);
-        }
-        size_t at = begin;
-        for (size_t i; next_of_part(turn, k == 0, begin, end, &at, &i);) {
-            const uint32_t t = order->share[i], next = order->share[i + 1 < end ? i + 1 : i];
-            const struct mpm_stretch *stretch = &order->stretch[t];
-            if (there > 1) {
-                await_before(w, own, t, begin, end, &since);
-            }
-            if (next != t && (w->grid_is_far || order->ties[next])) {
-                nodes_ahead(w, t, next, own);
-            }
-            work_on(w, stretch->begin, stretch->end, order->stretch[next].begin, &found, NULL);
-            work += stretch->end - stretch->begin;
-            if (there > 1) {
-                say_done(w, t, begin, end);
-            }
-        }
+    const size_t begin = walk->begin, end = walk->end;
+    const uint32_t t = order->share[i], next = order->share[i + 1 < end ? i + 1 : i];
+    const struct mpm_stretch *stretch = &order->stretch[t];
+    if (walk->there > 1) {
+        await_before(w, walk->own, t, begin, end, &walk->since);
     }
-    end_turn(w, own, &found, work, since);
+    if (next != t && (w->grid_is_far || order->ties[next])) {
+        nodes_ahead(w, t, next, walk->own);
+    }
+    work_on(w, stretch->begin, stretch->end, order->stretch[next].begin, &walk->found, NULL);
+    if (walk->there > 1) {
+        say_done(w, t, begin, end);
+    }
+    return stretch->end - stretch->begin;
 }
 
 // In whole blocks of particles: of one that two stretches share no lane is idle.
@@ -337,32 +332,42 @@ static size_t chunk_begin(const struct mpm_order *order, size_t chunk) {
 
 // All other work goes by chunks, in the same parts. They do not take equal time, since what flows
 // costs more.
-static void work_on_chunks(const struct part_work *w, int own, int there) {
+static size_t work_on_chunk(const struct part_work *w, struct walk *walk, size_t i) {
     const struct mpm_order *order = w->order;
-    const size_t n = w->span.s->n;
-    struct mpm_span_result found = mpm_nothing_found();
-    double since = there > 1 ? mpm_now_or_zero(w->sim) : 0;
+    const bool last_of_part = i + 1 == walk->end;
+    const size_t begin = chunk_begin(order, i);
+    const size_t end = i + 1 < order->n_chunks ? chunk_begin(order, i + 1) : w->span.s->n;
+    const size_t next = chunk_begin(order, last_of_part ? walk->begin : i + 1);
+    for (uint32_t t = order->chunk[i + 1];
+         w->grid_is_far && !last_of_part && t < order->chunk[i + 2]; t++) {
+        nodes_ahead(w, t - 1, t, walk->own);
+    }
+    work_on(w, begin, end, next, &walk->found, w->mass_dx[i]);
+    return end - begin;
+}
+
+static void work_on_parts(const struct part_work *w, int own, int there) {
+    const bool adds = w->pass->adds;
+    struct walk walk = {.own = own,
+                        .there = there,
+                        .found = mpm_nothing_found(),
+                        .since = there > 1 ? mpm_now_or_zero(w->sim) : 0};
     size_t work = 0;
     for (int k = 0; k < w->n_parts; k++) {
         const int part = (own + k) % w->n_parts;
+        const uint32_t first = w->parts[part], last = w->parts[part + 1];
         struct mpm_turn *turn = &w->sim->turns[part];
-        const size_t first = w->parts[part], last = w->parts[part + 1];
-        if (k == 0 && last - first >= MPM_FEW) {
-            begin_turn(turn, first, last);
+        walk.begin = adds ? w->order->chunk[first] : first;
+        walk.end = adds ? w->order->chunk[last] : last;
+        if (k == 0 && walk.end - walk.begin >= MPM_FEW) {
+            begin_turn(turn, walk.begin, walk.end);
         }
-        size_t at = first;
-        for (size_t i; next_of_part(turn, k == 0, first, last, &at, &i);) {
-            const size_t end = i + 1 < order->n_chunks ? chunk_begin(order, i + 1) : n;
-            const size_t next = chunk_begin(order, i + 1 < last ? i + 1 : first);
-            for (uint32_t t = order->chunk[i + 1];
-                 w->grid_is_far && i + 1 < last && t < order->chunk[i + 2]; t++) {
-                nodes_ahead(w, t - 1, t, own);
-            }
-            work_on(w, chunk_begin(order, i), end, next, &found, w->mass_dx[i]);
-            work += end - chunk_begin(order, i);
+        size_t at = walk.begin;
+        for (size_t i; next_of_part(turn, k == 0, walk.begin, walk.end, &at, &i);) {
+            work += adds ? work_on_stretch(w, &walk, i) : work_on_chunk(w, &walk, i);
         }
     }
-    end_turn(w, own, &found, work, since);
+    end_turn(w, own, &walk.found, work, walk.since);
 }
 
 void mpm_pass(struct mpm_step_work *step, size_t body, const struct mpm_pass *pass, int own,
@@ -389,8 +394,6 @@ void mpm_pass(struct mpm_step_work *step, size_t body, const struct mpm_pass *pa
     w.number = step->pass++;
     if (pass->adds) {
         w.adding = ++step->number;
-        work_on_stretches(&w, own, there);
-    } else {
-        work_on_chunks(&w, own, there);
     }
+    work_on_parts(&w, own, there);
 }

@@ -20,9 +20,9 @@
 #include "server/mpm/simd.h"
 
 // How often a thread looks at a word before it sleeps: each time takes some 17 ns, up to three
-// times that where the processor's pause is long. To be woken takes as long as many looks; so it
-// goes on while that mostly spares the sleep. Where threads outnumber the cores it does not: then
-// looks take time from who is waited for.
+// times that where the processor's pause is long. To be woken takes as long as one or two thousand
+// looks; so it goes on while that mostly spares the sleep. Where threads outnumber the cores it
+// does not: then looks take time from who is waited for.
 #define MANY_LOOKS 4000
 #define FEW_LOOKS 100
 // Waits that outlast the few, after which it decides: half of them may outlast the many, too. After
